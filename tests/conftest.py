@@ -1,0 +1,57 @@
+"""What all tests share: run-time type checks, one thread, a fixed Hypothesis profile, shapes with exact answers."""
+
+import importlib
+import sys
+from pathlib import Path
+
+from jaxtyping import install_import_hook
+
+sys.path.insert(0, str(Path(__file__).parent))  # for `references`
+# Before anything imports torchqm: annotations of its functions become checks, in the tests only.
+importlib.import_module("references.checker")
+install_import_hook("torchqm", "references.checker.checked")
+
+import hypothesis  # noqa: E402
+import pytest  # noqa: E402
+import torch  # noqa: E402
+from references import shapes  # noqa: E402
+
+torch.set_num_threads(1)  # sums in one order, so that equal runs give equal bits
+hypothesis.settings.register_profile("torchqm", deadline=None, derandomize=True, max_examples=20, database=None)
+hypothesis.settings.load_profile("torchqm")
+
+
+@pytest.fixture(scope="session")
+def sphere():
+    """Unit icosphere, 642 vertices; spectrum l (l + 1)."""
+    return shapes.icosphere(3)
+
+
+@pytest.fixture(scope="session", params=[1, 2, 4, 8], ids=lambda order: f"group{order}")
+def blob(request):
+    """A bumpy ellipsoid and its exact group of 1, 2, 4 and 8 elements (642 vertices)."""
+    return shapes.blob(request.param)
+
+
+@pytest.fixture(scope="session")
+def mirror_blob():
+    """A bumpy ellipsoid with one exact mirror plane, x = 0."""
+    return shapes.blob(2)
+
+
+@pytest.fixture(scope="session")
+def box():
+    """A cuboid with its 8 exact symmetries."""
+    return shapes.box()
+
+
+@pytest.fixture(scope="session")
+def prism():
+    """A square prism with its 16 exact symmetries and pairs of equal eigenvalues."""
+    return shapes.prism()
+
+
+@pytest.fixture(scope="session")
+def rectangle():
+    """A flat rectangle ``[0, 1.5] x [0, 1]`` with boundary (Neumann spectrum)."""
+    return shapes.grid(24, 16, 1.5, 1.0)

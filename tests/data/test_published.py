@@ -1,0 +1,188 @@
+"""The reader of the SCB result files, on hand-made files of the real format and, where at hand, on the real ones."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchqm.data.published import (
+    RESULT_FOLDER,
+    PublishedResult,
+    load_published,
+    natural_key,
+    published_names,
+    read_published,
+    summarize_published,
+)
+
+REAL = os.environ.get("TORCHQM_SCB")
+
+
+def result_text(
+    plain: str = "[0.01, 0.03, 0.08]", average: str = "[0.04]", flipped: str = "true", time: str = "474"
+) -> str:
+    """The layout of BenchResult_BlendedMap_cat0_to_cat6.txt, tab for tab, with three samples and two landmarks."""
+    return f"""Stats:
+\tAverage\t{average}
+\tFolder\t[cat0]
+\tGuessed\t[0.993164]
+\tNumGen\t[6, 6]
+\tObjFn\t[0]
+\tPerSampleErrors\t{plain}
+\tTime\t[{time}]
+\tTimeBench\t[0]
+Stats1:
+\tAverage\t[0.5]
+\tGuessed\t[0]
+\tNumGen\t[6, 6]
+\tObjFn\t[0.7]
+\tPerSampleErrors\t[0.5, 0.5, 0.5]
+StatsWithFlip:
+\tAverage\t[0.015]
+\tFlipped\t[{flipped}]
+\tGuessed\t[1]
+\tNumGen\t[6, 6]
+\tObjFn\t[0]
+\tPerSampleErrors\t[0.03, 1.24143e-11]
+"""
+
+
+def write(folder: Path, name: str = "BenchResult_BlendedMap_cat0_to_cat6.txt", text: str | None = None) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / name
+    path.write_text(result_text() if text is None else text)
+    return path
+
+
+def test_reads_every_field(tmp_path: Path) -> None:
+    result = read_published(write(tmp_path))
+    assert (result.method, result.source, result.target, result.seconds) == ("BlendedMap", "cat0", "cat6", 474.0)
+    assert list(result.blocks) == ["Stats", "Stats1", "StatsWithFlip"]
+    assert result.plain.errors.tolist() == [0.01, 0.03, 0.08]
+    assert result.plain.flipped is None
+    assert result.landmarks is not None
+    assert result.landmarks.errors.tolist() == [0.03, 1.24143e-11]
+    assert result.landmarks.flipped is True
+
+
+def test_zero_time_means_not_stated(tmp_path: Path) -> None:
+    assert read_published(write(tmp_path, text=result_text(time="0"))).seconds is None
+
+
+def test_summary_is_the_mean_of_per_pair_means(tmp_path: Path) -> None:
+    """Candidates (Stats1) stay out; a pair counts once however many samples it has; blocks are not mixed."""
+    write(tmp_path / RESULT_FOLDER)
+    write(
+        tmp_path / RESULT_FOLDER,
+        "BenchResult_BlendedMap_cat2_to_cat10.txt",
+        result_text("[0.1]", "[0.1]", flipped="false", time="500"),
+    )
+    summary = summarize_published(load_published(tmp_path, "BlendedMap"))
+    assert summary.n_pairs == summary.n_landmark_pairs == 2
+    assert summary.plain == pytest.approx((0.04 + 0.1) / 2)
+    assert summary.landmarks == pytest.approx(0.015)
+    assert summary.flipped == 0.5
+    assert summary.median_seconds == 487.0
+
+
+def test_summary_refuses_mixed_or_no_results(tmp_path: Path) -> None:
+    one = read_published(write(tmp_path))
+    other = read_published(write(tmp_path, "BenchResult_BestConf_cat0_to_cat6.txt"))
+    with pytest.raises(ValueError, match="BestConf"):
+        summarize_published([one, other])
+    with pytest.raises(ValueError, match="none"):
+        summarize_published([])
+
+
+def test_folder_of_result_files_is_accepted_and_order_is_natural(tmp_path: Path) -> None:
+    for pair in ("cat10_to_cat3", "cat2_to_cat6", "cat2_to_cat1"):
+        write(tmp_path, f"BenchResult_BlendedMap_{pair}.txt")
+    pairs = [("cat2", "cat1"), ("cat2", "cat6"), ("cat10", "cat3")]
+    assert [(result.source, result.target) for result in load_published(tmp_path)] == pairs
+    assert published_names(tmp_path, "BlendedMap") == pairs
+
+
+def test_missing_folder_and_method_are_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="Results_Corr_TOSCA is not a folder"):
+        load_published(tmp_path)
+    write(tmp_path)
+    with pytest.raises(FileNotFoundError, match="methods with results there: BlendedMap"):
+        load_published(tmp_path, "LipmanGMDS")
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        read_published(tmp_path / "BenchResult_BlendedMap_cat1_to_cat6.txt")
+    with pytest.raises(ValueError, match="expected a name like"):
+        read_published(tmp_path / "cat1_to_cat6.txt")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no block 'Stats'"),
+        ("\tAverage\t[0.1]\n", ":1: expected a block name"),
+        ("Stats:\n\tAverage\t[0.1]\n", "'Stats' has no PerSampleErrors"),
+        (result_text().split(", 0.08")[0], ":7: expected 'Key .value, ....', got .* cut short"),
+        (result_text("[0.01, x, 0.08]"), ":7: expected a number, got ' x'"),
+        (result_text("[0.01, -0.03, 0.08]"), ":7: expected a finite number"),
+        (result_text("[0.01, nan, 0.08]"), ":7: expected a finite number"),
+        (
+            result_text("[0.01, 0.03]"),
+            ":7: the 2 errors of block 'Stats' have mean 0.02, but the file states Average 0.04",
+        ),
+        (result_text("[]"), ":7: expected a number"),
+        (result_text(flipped="maybe"), ":18: Flipped must be true or false"),
+        (result_text(time="soon"), ":8: expected a number"),
+        (result_text() + "Stats:\n", ":23: block 'Stats' occurs twice"),
+    ],
+)
+def test_malformed_files_name_file_and_line(tmp_path: Path, text: str, message: str) -> None:
+    path = write(tmp_path, text=text)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_published(path)
+    assert str(path) in str(caught.value)
+
+
+def test_natural_key_orders_mixed_names() -> None:
+    names = ["dog10", "dog", "dog0", "cat12", "cat2", "2x"]
+    assert sorted(names, key=natural_key) == ["2x", "cat2", "cat12", "dog", "dog0", "dog10"]
+
+
+@pytest.mark.skipif(not REAL, reason="TORCHQM_SCB does not point to an SCB folder")
+class TestRealFiles:
+    """Pinned to the benchmark's own summary pages, clusterTop.html and clusterTop_AllowingFlips.html."""
+
+    @pytest.mark.parametrize(
+        ("method", "plain", "landmarks", "flipped"),
+        [
+            ("BlendedMap", 0.034162, 0.037002, 0.0),
+            ("LipmanGMDS", 0.0984677, 0.0675925, 0.1125),
+            ("BestConf", 0.0840756, 0.104804, 0.0125),
+            ("BronsteinGMDS", 0.308529, 0.189602, 0.5375),
+            ("Ovsjanikov1", 0.239495, 0.203086, 0.4125),
+            ("Ovsjanikov2", 0.22871, 0.167001, 0.45),
+        ],
+    )
+    def test_means_are_those_of_the_benchmark(
+        self, method: str, plain: float, landmarks: float, flipped: float
+    ) -> None:
+        results = load_published(str(REAL), method)
+        summary = summarize_published(results)
+        assert summary.n_pairs == summary.n_landmark_pairs == 80
+        assert summary.plain == pytest.approx(plain, rel=5e-6)
+        assert summary.landmarks == pytest.approx(landmarks, rel=5e-6)
+        assert summary.flipped == flipped
+        assert {len(result.plain.errors) for result in results} == {1024}
+        assert {len(result.landmarks.errors) for result in results if result.landmarks} == {21, 36, 46}
+
+    def test_where_the_quoted_0311_comes_from(self) -> None:
+        """The better *block* of each pair, 1024 samples or some 30 landmarks, with the points pooled: no protocol."""
+        results = load_published(str(REAL), "BlendedMap")
+        pooled = torch.cat([self._better_block(result) for result in results])
+        assert float(pooled.mean()) == pytest.approx(0.0311, abs=5e-5)
+        assert float((pooled < 0.05).double().mean()) == pytest.approx(0.86, abs=5e-3)
+        assert summarize_published(results).median_seconds == 490.5
+
+    @staticmethod
+    def _better_block(result: PublishedResult) -> torch.Tensor:
+        assert result.landmarks is not None
+        return min(result.plain.errors, result.landmarks.errors, key=lambda errors: float(errors.mean()))

@@ -1,0 +1,241 @@
+"""torchqm.fmap.refine: exact pairs are fixed points, perturbed maps come back, one step is the printed one."""
+
+import pytest
+import torch
+from references import dense
+from references.shapes import basis_of, blob, renumbered
+from references.unchecked import unchecked
+
+import torchqm.fmap.refine as module
+from torchqm.fmap import (
+    commutativity_energy,
+    correspondence_fmap,
+    fmap_to_p2p,
+    frequency_mask,
+    nearest_isometry,
+    p2p_to_fmap,
+    quotient_icp,
+    semi_quotient_icp,
+    semi_upsample,
+    upsample,
+    upsampling_sizes,
+)
+from torchqm.geometry import area_samples
+from torchqm.symmetry import symmetrized_basis
+from torchqm.testing import assert_orbit_equal
+
+K = 40
+
+
+class Pair:
+    """A mirror-symmetric blob, its renumbered copy, and the exact maps between all their bases."""
+
+    def __init__(self, order=2):
+        self.shape = blob(order)
+        self.full_x = basis_of(self.shape.mesh, K)
+        self.copy = renumbered(self.shape, K)
+        self.full_y = self.copy.basis
+        self.split_x = symmetrized_basis(self.full_x, self.shape.group)
+        self.split_y = symmetrized_basis(self.full_y, self.copy.shape.group)
+        self.even_x, self.even_y = self.split_x.even, self.split_y.even
+        self.even = p2p_to_fmap(self.copy.p2p_yx, self.even_x, self.even_y)
+        self.semi = p2p_to_fmap(self.copy.p2p_yx, self.full_x, self.even_y)
+        self.samples = area_samples(self.shape.mesh, 300, 0)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return Pair()
+
+
+def noise(*shape, seed=0):
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def identity(k):
+    return torch.eye(k, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("shape", [(5, 5), (3, 6), (6, 3)])
+def test_nearest_isometry(shape):
+    matrix = noise(*shape)
+    found = nearest_isometry(matrix)
+    torch.testing.assert_close(torch.linalg.svdvals(found), torch.ones(min(shape), dtype=torch.float64))
+    torch.testing.assert_close(nearest_isometry(found), found)
+    for seed in range(1, 20):  # none is nearer
+        other = nearest_isometry(found + 0.3 * noise(*shape, seed=seed))
+        assert (matrix - found).norm() < (matrix - other).norm()
+
+
+def test_nearest_isometry_keeps_the_kernel():
+    wide = noise(3, 6)
+    found = nearest_isometry(wide)
+    kernel = identity(6) - torch.linalg.pinv(wide) @ wide
+    assert (found @ kernel).abs().max() < 1e-12
+
+
+def test_frequency_mask():
+    mu, lam = torch.tensor([0.0, 1.0, 4.0]).double(), torch.tensor([0.0, 2.0]).double()
+    mask = frequency_mask(mu, lam, 0.5)
+    assert mask.shape == (2, 3)
+    assert mask[0, 0] == 1
+    assert float(mask[1, 2]) == pytest.approx(torch.exp(torch.tensor(-1.0)).item())  # |4 - 2| / 4 / 0.5 = 1
+    assert float(mask[0, 2]) == pytest.approx(torch.exp(torch.tensor(-4.0)).item())
+
+
+@pytest.mark.parametrize("time", [0.0, 0.02])
+def test_one_step_is_the_printed_one(pair, time):
+    samples = pair.samples[:40]
+    start = pair.even + 0.1 * noise(*pair.even.shape)
+    torch.testing.assert_close(
+        quotient_icp(start, pair.even_x, pair.even_y, samples, steps=1, time=time),
+        dense.icp_step(start, pair.even_x, pair.even_y, samples, time),
+        atol=1e-9,
+        rtol=0,
+    )
+
+
+def test_lemma_4_1(pair):
+    """The exact map is an isometry, commutes, and sends deltas to deltas: a fixed point of quotient-ICP."""
+    torch.testing.assert_close(pair.even @ pair.even.T, identity(pair.even_y.k), atol=1e-8, rtol=0)
+    assert float(commutativity_energy(pair.even, pair.even_x.evals, pair.even_y.evals)) < 1e-12
+    torch.testing.assert_close(pair.even_x.evecs @ pair.even.T, pair.even_y.evecs[pair.copy.p2p_xy], atol=1e-7, rtol=0)
+    refined = quotient_icp(pair.even, pair.even_x, pair.even_y, pair.samples, steps=3)
+    torch.testing.assert_close(refined, pair.even, atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("options", [{}, {"time": 0.01}, {"width": 0.5}], ids=str)
+def test_quotient_icp_comes_back_to_the_exact_map(pair, seed, options):
+    start = pair.even + 0.08 * noise(*pair.even.shape, seed=seed)
+    before = fmap_to_p2p(start, pair.even_x, pair.even_y)
+    with pytest.raises(AssertionError):
+        assert_orbit_equal(before, pair.copy.p2p_xy, pair.copy.shape.group.orbits)
+    refined = quotient_icp(start, pair.even_x, pair.even_y, pair.samples, steps=30, **options)
+    torch.testing.assert_close(refined, pair.even, atol=1e-7, rtol=0)
+    after = fmap_to_p2p(refined, pair.even_x, pair.even_y)
+    assert_orbit_equal(after, pair.copy.p2p_xy, pair.copy.shape.group.orbits)
+
+
+@pytest.mark.parametrize("order", [4, 8])
+def test_quotient_icp_with_larger_groups(order):
+    pair = Pair(order)
+    start = pair.even + 0.08 * noise(*pair.even.shape)
+    refined = quotient_icp(start, pair.even_x, pair.even_y, pair.samples, steps=30)
+    found = fmap_to_p2p(refined, pair.even_x, pair.even_y)
+    assert_orbit_equal(found, pair.copy.p2p_xy, pair.copy.shape.group.orbits)
+
+
+def test_it_stops_when_the_map_stays(pair, monkeypatch):
+    calls = []
+    search = module.nearest_used
+    monkeypatch.setattr(module, "nearest_used", lambda *a: calls.append(1) or search(*a))
+    quotient_icp(pair.even, pair.even_x, pair.even_y, pair.samples, steps=50)
+    assert len(calls) == 1
+    start = pair.even + 0.08 * noise(*pair.even.shape)
+    quotient_icp(start, pair.even_x, pair.even_y, pair.samples, steps=50)
+    assert 3 < len(calls) < 20
+
+
+def test_no_steps_change_nothing(pair):
+    assert quotient_icp(pair.even, pair.even_x, pair.even_y, pair.samples, steps=0) is pair.even
+
+
+def test_lemma_5_1(pair):
+    """R = pi+ T: commutes; the complement of its kernel is L2+(M), on which it is an isometry; deltas go to deltas."""
+    fmap = pair.semi
+    assert fmap.shape == (pair.even_y.k, K)
+    assert float(commutativity_energy(fmap, pair.full_x.evals, pair.even_y.evals)) < 1e-12
+    torch.testing.assert_close(torch.linalg.svdvals(fmap), torch.ones(pair.even_y.k).double(), atol=1e-8, rtol=0)
+    on_even = pair.split_x.even_coeffs @ pair.split_x.even_coeffs.T
+    torch.testing.assert_close(fmap.T @ fmap, on_even, atol=1e-8, rtol=0)
+    assert (fmap @ pair.split_x.odd_coeffs).abs().max() < 1e-8
+    torch.testing.assert_close(pair.full_x.evecs @ fmap.T, pair.even_y.evecs[pair.copy.p2p_xy], atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_semi_quotient_icp_comes_back_to_the_exact_map(pair, seed):
+    start = pair.semi + 0.05 * noise(*pair.semi.shape, seed=seed)
+    everywhere = torch.arange(642)
+    refined = semi_quotient_icp(start, pair.full_x, pair.even_y, everywhere, steps=30)
+    found = fmap_to_p2p(refined, pair.full_x, pair.even_y)
+    orbits = pair.copy.shape.group.orbits
+    right = (orbits[found] == pair.copy.p2p_xy[:, None]).any(1).double().mean()
+    before = fmap_to_p2p(start, pair.full_x, pair.even_y)
+    wrong_before = 1 - (orbits[before] == pair.copy.p2p_xy[:, None]).any(1).double().mean()
+    assert right > 0.99
+    assert wrong_before > 0.05
+    on_even = pair.split_x.even_coeffs @ pair.split_x.even_coeffs.T
+    assert (refined.T @ refined - on_even).norm() < 0.1 * (start.T @ start - on_even).norm()
+
+
+def test_upsampling_sizes():
+    assert upsampling_sizes(30, 100, 30) == [60, 90, 100]
+    assert upsampling_sizes(30, 90, 30) == [60, 90]
+    assert upsampling_sizes(30, 30, 5) == [30]
+    assert upsampling_sizes(30, 20, 5) == [20]
+    for step, stop in ((0, 10), (5, 0)):
+        with pytest.raises(ValueError, match=f"step={step}, stop={stop}"):
+            upsampling_sizes(3, stop, step)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_upsample_reaches_the_exact_map(pair, steps):
+    start = pair.even[:10, :10] + 0.05 * noise(10, 10)
+    sizes = upsampling_sizes(10, pair.even_x.k, 4)
+    found = upsample(start, pair.even_x, pair.even_y, pair.samples, sizes, steps)
+    assert found.shape == (pair.even_y.k, pair.even_x.k)
+    torch.testing.assert_close(found, pair.even, atol=1e-7, rtol=0)
+    assert_orbit_equal(fmap_to_p2p(found, pair.even_x, pair.even_y), pair.copy.p2p_xy, pair.copy.shape.group.orbits)
+
+
+def test_upsample_full_bases_finds_the_isometry(pair):
+    exact = p2p_to_fmap(pair.copy.p2p_yx, pair.full_x, pair.full_y)
+    start = exact[:15, :15] + 0.05 * noise(15, 15)
+    found = upsample(start, pair.full_x, pair.full_y, pair.samples, upsampling_sizes(15, K, 5))
+    torch.testing.assert_close(found, exact, atol=1e-7, rtol=0)
+    assert torch.equal(fmap_to_p2p(found, pair.full_x, pair.full_y), pair.copy.p2p_xy)
+
+
+@pytest.mark.parametrize("width", [0.2, None])
+def test_semi_upsample_reaches_the_exact_map(pair, width):
+    start = p2p_to_fmap(pair.copy.p2p_yx, pair.full_x.truncate(15), pair.even_y.truncate(9)) + 0.02 * noise(9, 15)
+    everywhere = torch.arange(642)
+    found = semi_upsample(start, pair.full_x, pair.even_y, everywhere, [*upsampling_sizes(15, K, 5), K], width)
+    assert found.shape == (pair.even_y.k, K)
+    orbits = pair.copy.shape.group.orbits
+    at = fmap_to_p2p(found, pair.full_x, pair.even_y)
+    assert (orbits[at] == pair.copy.p2p_xy[:, None]).any(1).double().mean() > 0.98
+
+
+def test_semi_upsample_takes_the_symmetric_functions_as_low_as_those_of_x(pair):
+    start = pair.semi[:9, :15]
+    for size in (20, 33):
+        found = semi_upsample(start, pair.full_x, pair.even_y, pair.samples, [size])
+        low = int((pair.even_y.evals <= pair.full_x.evals[size - 1] + 1e-6).sum())
+        assert found.shape == (low, size)
+
+
+def test_correspondence_fmap_of_an_exact_map(pair):
+    everywhere = torch.arange(642)
+    found = correspondence_fmap(pair.copy.p2p_xy, pair.full_x, pair.full_y, everywhere)
+    torch.testing.assert_close(found, p2p_to_fmap(pair.copy.p2p_yx, pair.full_x, pair.full_y), atol=1e-7, rtol=0)
+    torch.testing.assert_close(found @ found.T, identity(K), atol=1e-10, rtol=0)
+
+
+def test_upsample_without_sizes_changes_nothing(pair):
+    assert upsample(pair.even, pair.even_x, pair.even_y, pair.samples, []) is pair.even
+
+
+def test_refusals(pair):
+    arguments = (pair.even_x, pair.even_y, pair.samples)
+    with pytest.raises(ValueError, match="steps=-1"):
+        quotient_icp(pair.even, *arguments, steps=-1)
+    with pytest.raises(ValueError, match=rf"expected shape \({pair.even_y.k}, {pair.even_x.k}\), got \(3, 3\)"):
+        unchecked(quotient_icp)(identity(3), *arguments)
+    with pytest.raises(ValueError, match=f"target has {K} symmetric functions, the source only {pair.even_x.k}"):
+        semi_quotient_icp(pair.semi.T, pair.even_x, pair.full_y, pair.samples)
+    with pytest.raises(ValueError, match=f"sizes up to 41: the bases have {pair.even_x.k} and {pair.even_y.k}"):
+        upsample(pair.even, *arguments, [12, 41])
+    with pytest.raises(ValueError, match="k=0"):
+        upsample(pair.even, *arguments, [0])

@@ -1,0 +1,91 @@
+"""torchqm.symmetry.extrinsic: exact mirror planes are found wherever they lie, and none is made up."""
+
+import numpy as np
+import pytest
+import torch
+from references.shapes import blob, icosphere, rotation
+
+from torchqm.geometry import Mesh
+from torchqm.symmetry import SymmetryGroup, find_reflection
+from torchqm.testing import assert_orbit_equal
+
+
+def lopsided() -> Mesh:
+    """A ball with bumps of four sizes in no common plane."""
+    ball = icosphere(3)
+    radius = torch.ones(ball.n_verts, dtype=torch.float64)
+    for place, height in (((1, 0, 0), 1.5), ((0, 1, 0.3), 1.1), ((-0.4, 0.2, 1), 0.8), ((-1, -1, -0.5), 0.5)):
+        towards = torch.tensor(place, dtype=torch.float64)
+        radius += height * torch.exp(-6 * (1 - ball.verts @ (towards / towards.norm())))
+    return ball.moved(ball.verts * radius[:, None])
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_exact_plane_of_a_moved_blob(seed):
+    mesh, group = blob(2)
+    turn, shift = rotation(seed), torch.tensor([3.0, -2.0, 0.5], dtype=torch.float64) * seed
+    found = find_reflection(mesh.moved(10.0**seed * (mesh.verts @ turn.T + shift)))
+    assert torch.equal(found.map, group.maps[1])
+    assert found.residual < 1e-9
+    assert found.residual_max < 1e-9
+    assert found.convincing
+    assert abs(float(found.normal @ turn[:, 0])) == pytest.approx(1, abs=1e-9)
+    assert float(found.normal.norm()) == pytest.approx(1)
+    assert found.normal[found.normal.abs().argmax()] > 0
+    side = found.side(10.0**seed * (mesh.verts @ turn.T + shift))
+    torch.testing.assert_close(side.abs(), 10.0**seed * mesh.verts[:, 0].abs(), atol=1e-7, rtol=1e-7)
+    torch.testing.assert_close(side[found.map], -side, atol=1e-7, rtol=1e-7)
+
+
+def test_any_of_several_planes_will_do():
+    mesh, group = blob(8)
+    found = find_reflection(mesh.moved(mesh.verts @ rotation(5).T))
+    assert found.residual < 1e-9
+    planes = [g for g in (1, 2, 4) if torch.equal(found.map, group.maps[g])]
+    assert len(planes) == 1
+
+
+def test_different_triangulations_left_and_right():
+    mesh, group = blob(2)
+    moved = mesh.verts + torch.where(mesh.verts[:, :1] > 0.2, 0.004, 0.0)  # the right half's vertices sit elsewhere
+    found = find_reflection(mesh.moved(moved), n_refine=2)
+    assert found.convincing
+    assert 1e-4 < found.residual < 0.01
+    wrong = (found.map != group.maps[1]).double().mean()
+    assert wrong < 0.1
+
+
+def test_shape_without_a_plane_is_not_convincing():
+    mesh = lopsided()
+    found = find_reflection(mesh)
+    assert not found.convincing
+    assert found.residual_max >= found.residual
+    assert not find_reflection(blob(1).mesh).convincing  # a gentle asymmetry, no larger than the vertex spacing
+
+
+def test_vertices_without_faces_are_no_images():
+    mesh, group = blob(2)
+    far = torch.tensor([[50.0, 0, 0]], dtype=torch.float64)
+    found = find_reflection(Mesh(torch.cat([far, mesh.verts]), mesh.faces + 1))
+    assert torch.equal(found.map[1:] - 1, group.maps[1])
+    assert found.residual < 1e-9
+    assert int(found.map.min()) >= 1  # the stray vertex's own image included
+
+
+def test_same_seed_same_answer_and_group():
+    mesh = lopsided()
+    first, again = find_reflection(mesh, seed=3), find_reflection(mesh, seed=3)
+    assert torch.equal(first.map, again.map)
+    assert first.offset == again.offset
+    exact = find_reflection(blob(4).mesh)
+    group = SymmetryGroup.from_reflection(exact.map)
+    assert group.residuals(blob(4).mesh.verts).inverse == 0
+    assert_orbit_equal(exact.map, torch.arange(642), group.orbits)
+
+
+def test_few_samples_are_enough_for_an_exact_plane():
+    mesh, group = blob(2)
+    found = find_reflection(mesh.moved(mesh.verts @ rotation(1).T), n_samples=50, n_refine=1)
+    assert torch.equal(found.map, group.maps[1])
+    assert isinstance(found.offset, float)
+    assert np.isfinite(found.spacing)

@@ -1,0 +1,80 @@
+"""torchqm.symmetry.orientation: exact integrals, signs under reflections and flipped faces."""
+
+from math import pi
+
+import pytest
+import torch
+from references.dense import orientation_coefficients as slow_coefficients
+from references.shapes import basis_of, icosphere, rotation
+
+from torchqm.geometry import Mesh
+from torchqm.symmetry import function_pairs, orientation_coefficients, orientation_form, symmetrized_basis
+
+PAIR = torch.tensor([[0], [1]])
+
+
+def test_function_pairs():
+    assert function_pairs(5).shape == (2, 6)
+    assert function_pairs(2).shape == (2, 0)
+    assert function_pairs(1).shape == (2, 0)
+    a, b = function_pairs(6)
+    assert bool((a < b).all())
+    assert int(a.min()) == 1
+    assert len(set(zip(a.tolist(), b.tolist(), strict=True))) == 10
+
+
+def test_integral_on_the_sphere():
+    """On the unit sphere n . (grad x cross grad y) = z, and the integral of z^2 is 4 pi / 3."""
+    errors = []
+    for level in (2, 3, 4):
+        mesh = icosphere(level)
+        found = orientation_coefficients(mesh, mesh.verts[:, :2], PAIR, mesh.verts[:, 2:])
+        errors.append(abs(float(found) - 4 * pi / 3))
+    assert errors[2] < 0.01
+    assert errors[1] / errors[2] == pytest.approx(4, rel=0.1)
+
+
+def test_is_the_formula_in_space(mirror_blob):
+    mesh, basis = mirror_blob.mesh, basis_of(mirror_blob.mesh, 8)
+    pairs = torch.tensor([[1, 4], [2, 3]])
+    fast = orientation_coefficients(mesh, basis.evecs, pairs, basis.evecs)
+    for p, (a, b) in enumerate(pairs.T.tolist()):
+        for k in (5,):
+            slow = slow_coefficients(mesh.verts, mesh.faces, *(basis.evecs[:, i] for i in (a, b, k)))
+            assert float(fast[k, p]) == pytest.approx(slow, abs=1e-12)
+
+
+def test_is_antisymmetric_and_blind_to_constants(mirror_blob):
+    mesh, basis = mirror_blob.mesh, basis_of(mirror_blob.mesh, 8)
+    pairs = function_pairs(8)
+    form = orientation_form(mesh, basis.evecs, pairs)
+    assert torch.equal(orientation_form(mesh, basis.evecs, pairs.flip(0)), -form)
+    torch.testing.assert_close(orientation_form(mesh, basis.evecs + 7, pairs), form, atol=1e-13, rtol=0)
+    same = pairs[:1].expand(2, -1).contiguous()
+    assert orientation_form(mesh, basis.evecs, same).abs().max() == 0
+    # a total derivative: on a closed surface it integrates to zero
+    assert orientation_coefficients(mesh, basis.evecs, pairs, torch.ones(642, 1).double()).abs().max() < 1e-12
+
+
+def test_flipped_faces_change_the_sign_and_motion_nothing(mirror_blob):
+    mesh, basis = mirror_blob.mesh, basis_of(mirror_blob.mesh, 8)
+    pairs = function_pairs(8)
+    coefficients = orientation_coefficients(mesh, basis.evecs, pairs, basis.evecs)
+    inside_out = Mesh(mesh.verts, mesh.faces.flip(1))
+    torch.testing.assert_close(
+        orientation_coefficients(inside_out, basis.evecs, pairs, basis.evecs), -coefficients, atol=1e-15, rtol=0
+    )
+    moved = mesh.moved(3 * mesh.verts @ rotation(0).T + 1)
+    assert torch.equal(orientation_coefficients(moved, basis.evecs, pairs, basis.evecs), coefficients)
+
+
+def test_symmetric_functions_give_odd_ones(mirror_blob):
+    mesh, group = mirror_blob
+    split = symmetrized_basis(basis_of(mesh, 30), group)
+    pairs = function_pairs(6)
+    on_even = orientation_coefficients(mesh, split.even.evecs, pairs, split.even.evecs)
+    on_odd = orientation_coefficients(mesh, split.even.evecs, pairs, split.odd.evecs)
+    assert on_even.abs().max() < 1e-8
+    assert on_odd.abs().max() > 0.1
+    mirrored = orientation_coefficients(mesh, split.even.evecs, pairs, split.odd.evecs[group.maps[1]])
+    torch.testing.assert_close(mirrored, -on_odd, atol=1e-8, rtol=0)

@@ -1,0 +1,42 @@
+"""Floor 4: functional maps - their energies, the solver, refinement, conversion to point maps and back."""
+
+from torchqm.fmap.convert import deltas, fmap_to_p2p, nearest_used, p2p_to_fmap
+from torchqm.fmap.energy import (
+    commutativity_energy,
+    commutativity_weights,
+    descriptor_energy,
+    orthogonality_energy,
+)
+from torchqm.fmap.nearest import nearest_rows
+from torchqm.fmap.refine import (
+    correspondence_fmap,
+    frequency_mask,
+    nearest_isometry,
+    quotient_icp,
+    semi_quotient_icp,
+    semi_upsample,
+    upsample,
+    upsampling_sizes,
+)
+from torchqm.fmap.solve import solve_fmap
+
+__all__ = [
+    "commutativity_energy",
+    "commutativity_weights",
+    "correspondence_fmap",
+    "deltas",
+    "descriptor_energy",
+    "fmap_to_p2p",
+    "frequency_mask",
+    "nearest_isometry",
+    "nearest_rows",
+    "nearest_used",
+    "orthogonality_energy",
+    "p2p_to_fmap",
+    "quotient_icp",
+    "semi_quotient_icp",
+    "semi_upsample",
+    "solve_fmap",
+    "upsample",
+    "upsampling_sizes",
+]

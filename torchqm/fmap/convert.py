@@ -1,0 +1,79 @@
+"""From functional maps to point maps and back (paper, section 4.4)."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchqm.fmap.nearest import nearest_rows
+from torchqm.spectral.basis import SpectralBasis
+
+__all__ = ["deltas", "fmap_to_p2p", "nearest_used", "p2p_to_fmap"]
+
+
+def deltas(basis: SpectralBasis, time: float = 0.0) -> Float[Tensor, "V K"]:
+    """Row x holds the coefficients of ``delta_{x,t}``, the heat that has spread from x for a time t.
+
+    ``<delta_{x,t}, phi_i> = exp(-lambda_i t) phi_i(x)``. In a basis of symmetric functions these are the
+    symmetrised deltas ``delta_+^{x,t}`` of the paper: the projection needs no extra work.
+
+    Args:
+        basis: eigenfunctions of the full space or of L2+.
+        time: diffusion time t >= 0, in units of area; 0 gives the (band-limited) Dirac deltas.
+
+    References:
+        Paper, section 4.2.
+    """
+    if time < 0:
+        raise ValueError(f"time={time}: heat does not flow backwards; give 0 or more")
+    return basis.evecs if time == 0 else basis.evecs * torch.exp(-time * basis.evals)
+
+
+def fmap_to_p2p(
+    fmap_xy: Float[Tensor, "Ky Kx"], basis_x: SpectralBasis, basis_y: SpectralBasis, time: float = 0.0
+) -> Int[Tensor, " Vx"]:
+    """``T(x) = argmin_y || C delta_{x,t} - delta_{y,t} ||``: the vertex whose delta is nearest to the image of a delta.
+
+    Args:
+        fmap_xy: takes functions on x to functions on y.
+        basis_x: basis of x with Kx functions (even ones for a map on the quotient).
+        basis_y: basis of y with Ky functions. With symmetric functions the result is a *point-to-orbit* map: which
+            of the points of an orbit comes back is arbitrary.
+        time: diffusion time, as in :func:`deltas`.
+
+    Returns:
+        ``p2p_xy`` ``(Vx,)``: for each vertex of x a vertex of y (always one that a face uses).
+
+    References:
+        Paper, section 4.4.
+    """
+    images = deltas(basis_x, time) @ fmap_xy.T
+    return nearest_used(images, basis_y, time)
+
+
+def nearest_used(images: Float[Tensor, "Q Ky"], basis_y: SpectralBasis, time: float = 0.0) -> Int[Tensor, " Q"]:
+    """The vertex of y with area whose delta is nearest to each row of ``images``."""
+    used = basis_y.mass > 0
+    points = deltas(basis_y, time)
+    if bool(used.all()):
+        return nearest_rows(images, points)
+    ids = used.nonzero().flatten()
+    return ids[nearest_rows(images, points[ids])]
+
+
+def p2p_to_fmap(p2p_yx: Int[Tensor, " Vy"], basis_x: SpectralBasis, basis_y: SpectralBasis) -> Float[Tensor, "Ky Kx"]:
+    """The pull-back along a point map: ``C f = f o T`` with ``T = p2p_yx``, so ``C = Phi_y^T A_y Phi_x[T]``.
+
+    Args:
+        p2p_yx: for each vertex of y a vertex of x.
+        basis_x: basis of x.
+        basis_y: basis of y.
+
+    Returns:
+        ``fmap_xy``: takes functions on x to functions on y.
+
+    References:
+        Paper, section 2.
+    """
+    if p2p_yx.shape[0] != basis_y.n_verts:
+        raise ValueError(f"p2p_yx has {p2p_yx.shape[0]} entries, but y has {basis_y.n_verts} vertices")
+    return basis_y.coefficients(basis_x.evecs[p2p_yx])

@@ -1,0 +1,75 @@
+"""The initial functional map: descriptor preservation and Laplacian commutativity, closed form (paper, section 4.3)."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchqm.fmap.energy import commutativity_weights
+
+__all__ = ["solve_fmap"]
+
+
+def solve_fmap(
+    coeffs_x: Float[Tensor, "Kx C"],
+    coeffs_y: Float[Tensor, "Ky C"],
+    evals_x: Float[Tensor, " Kx"],
+    evals_y: Float[Tensor, " Ky"],
+    weight: float = 1.0,
+    normalize: bool = True,
+) -> Float[Tensor, "Ky Kx"]:
+    """Minimise ``sum_s || C f_s - g_s ||^2 + w sum_ij C_ij^2 (lambda_j - mu_i)^2`` over all matrices C.
+
+    The energy separates over the rows of C. Row i solves ``(F F^T + w diag((lambda_j - mu_i)^2)) c_i = F g_i``; all
+    rows go through one batched Cholesky factorisation.
+
+    Args:
+        coeffs_x: ``(Kx, C)`` descriptors of the source in its basis (the f_s as columns).
+        coeffs_y: ``(Ky, C)`` the same descriptors of the target (g_s).
+        evals_x: ``(Kx,)`` eigenvalues of the source basis; Kx and Ky may differ (semi-quotient).
+        evals_y: ``(Ky,)`` eigenvalues of the target basis.
+        weight: w, with eigenvalues scaled to ``[0, 1]`` if ``normalize``.
+        normalize: divide both spectra by the larger of their maxima, so that ``weight`` has no unit.
+
+    Returns:
+        ``fmap_xy`` ``(Ky, Kx)``: takes functions on x to functions on y.
+
+    Raises:
+        ValueError: the descriptors do not fit each other or the eigenvalues, ``weight`` is negative, or the problem has
+            no unique solution (too few independent descriptors and no commutativity weight).
+
+    Example:
+        >>> f = torch.eye(2, dtype=torch.float64)
+        >>> spectrum = torch.tensor([0.0, 1.0], dtype=torch.float64)
+        >>> solve_fmap(f, -f, spectrum, spectrum).round().tolist()
+        [[-1.0, 0.0], [0.0, -1.0]]
+
+    References:
+        Paper, section 4.3, E_0 = E_sig + E_com; Ovsjanikov et al. 2012, section 6.
+    """
+    if coeffs_x.shape[1] != coeffs_y.shape[1]:
+        raise ValueError(
+            f"coeffs_x has {coeffs_x.shape[1]} descriptors, coeffs_y has {coeffs_y.shape[1]}: they must agree"
+        )
+    if coeffs_x.shape[0] != evals_x.shape[0] or coeffs_y.shape[0] != evals_y.shape[0]:
+        raise ValueError(
+            f"coefficients of {coeffs_x.shape[0]} and {coeffs_y.shape[0]} basis functions do not fit "
+            f"{evals_x.shape[0]} and {evals_y.shape[0]} eigenvalues"
+        )
+    if weight < 0:
+        raise ValueError(f"weight={weight}: the commutativity weight must not be negative")
+    if normalize:
+        scale = torch.maximum(evals_x.max(), evals_y.max()).clamp_min(1e-300)
+        evals_x, evals_y = evals_x / scale, evals_y / scale
+    gram = coeffs_x @ coeffs_x.T
+    systems = gram[None] + torch.diag_embed(weight * commutativity_weights(evals_x, evals_y))
+    factor, info = torch.linalg.cholesky_ex(systems)
+    diagonal = factor.diagonal(dim1=1, dim2=2)
+    # A pivot that rounding alone keeps above zero: the row is undetermined, and its solution would be noise.
+    singular = (info > 0) | (diagonal.min(1).values <= 1e-7 * diagonal.max(1).values.clamp_min(1e-300))
+    if bool(singular.any()):
+        rows = singular.nonzero().flatten().tolist()
+        raise ValueError(
+            f"the descriptors (rank {int(torch.linalg.matrix_rank(gram))} of {gram.shape[0]}) and weight={weight} "
+            f"leave row(s) {rows[:5]} of the map undetermined; give a positive weight or more descriptors"
+        )
+    return torch.cholesky_solve((coeffs_y @ coeffs_x.T)[:, :, None], factor)[:, :, 0]

@@ -1,0 +1,49 @@
+"""Floor 1: meshes, their files and faults, Laplacians, geodesic distances and samples of vertices."""
+
+from torchqm.geometry.check import (
+    MeshError,
+    MeshReport,
+    check_mesh,
+    clean_faces,
+    inspect_mesh,
+    orient_faces,
+    weld,
+)
+from torchqm.geometry.geodesic import EdgePoints, distance_to_curve, distances, edge_graph, nodal_crossings
+from torchqm.geometry.io import load_mesh, save_mesh
+from torchqm.geometry.laplacian import (
+    Laplacian,
+    cotan_stiffness,
+    laplacian,
+    lumped_mass,
+    robust_stiffness,
+    to_scipy,
+)
+from torchqm.geometry.mesh import Mesh
+from torchqm.geometry.sampling import area_samples, farthest_points
+
+__all__ = [
+    "EdgePoints",
+    "Laplacian",
+    "Mesh",
+    "MeshError",
+    "MeshReport",
+    "area_samples",
+    "check_mesh",
+    "clean_faces",
+    "cotan_stiffness",
+    "distance_to_curve",
+    "distances",
+    "edge_graph",
+    "farthest_points",
+    "inspect_mesh",
+    "laplacian",
+    "load_mesh",
+    "lumped_mass",
+    "nodal_crossings",
+    "orient_faces",
+    "robust_stiffness",
+    "save_mesh",
+    "to_scipy",
+    "weld",
+]

@@ -1,0 +1,43 @@
+"""Floor 5: the matchers: quotient, semi-quotient, symmetry transfer, and the pipeline that joins them."""
+
+from torchqm.matching.known import KnownSymmetry, extrinsic_symmetry, given_symmetry, no_symmetry, transferred_symmetry
+from torchqm.matching.odd import OddMap, join_blocks, solve_odd
+from torchqm.matching.parameters import MatchParameters
+from torchqm.matching.pipeline import METHODS, Collection, find_symmetry, match, match_prepared
+from torchqm.matching.quotient import QuotientMatch, choose_halves, match_quotient, refine_by_icp, refine_by_odd_block
+from torchqm.matching.result import MatchResult, SymmetryResult
+from torchqm.matching.semi_quotient import SemiQuotientMatch, match_semi_quotient, pull_back
+from torchqm.matching.shape import PreparedShape, prepare
+from torchqm.matching.transfer import SymmetryTransfer, nearest_involution, transfer_symmetry
+
+__all__ = [
+    "METHODS",
+    "Collection",
+    "KnownSymmetry",
+    "MatchParameters",
+    "MatchResult",
+    "OddMap",
+    "PreparedShape",
+    "QuotientMatch",
+    "SemiQuotientMatch",
+    "SymmetryResult",
+    "SymmetryTransfer",
+    "choose_halves",
+    "extrinsic_symmetry",
+    "find_symmetry",
+    "given_symmetry",
+    "join_blocks",
+    "match",
+    "match_prepared",
+    "match_quotient",
+    "match_semi_quotient",
+    "nearest_involution",
+    "no_symmetry",
+    "prepare",
+    "pull_back",
+    "refine_by_icp",
+    "refine_by_odd_block",
+    "solve_odd",
+    "transfer_symmetry",
+    "transferred_symmetry",
+]

@@ -1,0 +1,70 @@
+"""The initial functional map between two shapes, on whatever pair of bases it is wanted (paper, sections 4.3 and 5)."""
+
+from collections.abc import Sequence
+
+from jaxtyping import Float
+from torch import Tensor
+
+from torchqm.fmap.solve import solve_fmap
+from torchqm.matching.parameters import MatchParameters
+from torchqm.spectral.basis import SpectralBasis
+from torchqm.spectral.descriptors import (
+    heat_kernel_signature,
+    heat_times,
+    split_descriptors,
+    unit_columns,
+    wave_energies,
+    wave_kernel_signature,
+)
+
+__all__ = ["initial_fmap", "shared_descriptors"]
+
+
+def shared_descriptors(
+    bases: Sequence[SpectralBasis], parameters: MatchParameters
+) -> list[Float[Tensor, "V C"]]:
+    """The split descriptors of several shapes, at the same energies and on the same value ranges.
+
+    Computed from all the functions that the bases hold (cut at the smaller number), not from the first ``k``: the same
+    local shape, told more sharply.
+    """
+    k = min(b.k for b in bases)
+    bases = [b.truncate(k) for b in bases]
+    if parameters.descriptor == "wks":
+        energies = wave_energies(bases, parameters.n_descriptors)
+        values = [wave_kernel_signature(b, energies) for b in bases]
+    else:
+        times = heat_times(bases, parameters.n_descriptors)
+        values = [heat_kernel_signature(b, times) for b in bases]
+    return split_descriptors(values, parameters.splits)
+
+
+def initial_fmap(
+    basis_x: SpectralBasis,
+    basis_y: SpectralBasis,
+    values_x: Float[Tensor, "Vx C"],
+    values_y: Float[Tensor, "Vy C"],
+    commutativity: float,
+) -> Float[Tensor, "Ky Kx"]:
+    """Least-squares map from descriptor preservation and commutativity, between any two bases of the two shapes.
+
+    Args:
+        basis_x: basis of the source: full (semi-quotient), or even (quotient).
+        basis_y: basis of the target.
+        values_x: ``(Vx, C)`` descriptors of the source.
+        values_y: ``(Vy, C)`` the same of the target.
+        commutativity: weight of the commutativity term per (descriptor / basis function).
+    """
+    coeffs_x, coeffs_y = unit_columns_pair(basis_x.coefficients(values_x), basis_y.coefficients(values_y))
+    weight = commutativity * coeffs_x.shape[1] / basis_x.k
+    return solve_fmap(coeffs_x, coeffs_y, basis_x.evals, basis_y.evals, weight)
+
+
+def unit_columns_pair(
+    coeffs_x: Float[Tensor, "Kx C"], coeffs_y: Float[Tensor, "Ky C"]
+) -> tuple[Float[Tensor, "Kx C"], Float[Tensor, "Ky C"]]:
+    """:func:`torchqm.spectral.descriptors.unit_columns` for two shapes."""
+    first, second = unit_columns([coeffs_x, coeffs_y])
+    return first, second
+
+

@@ -1,0 +1,130 @@
+"""Where a shape's symmetry comes from: its mirror plane, the user, or a reference shape."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchqm.matching.parameters import MatchParameters
+from torchqm.matching.shape import PreparedShape
+from torchqm.matching.transfer import transfer_symmetry
+from torchqm.symmetry.extrinsic import find_reflection
+from torchqm.symmetry.group import SymmetryGroup
+from torchqm.symmetry.leftright import displacement, persistence_clusters
+
+__all__ = ["KnownSymmetry", "extrinsic_symmetry", "given_symmetry", "no_symmetry", "transferred_symmetry"]
+
+
+@dataclass(frozen=True, eq=False)
+class KnownSymmetry:
+    """A symmetry group with the left-right map that goes with its reflection.
+
+    Args:
+        group: the group; trivial if the shape has no symmetry that is known.
+        sign: ``(V,)`` -1 on one half, +1 on the other, 0 on the axis; all 0 for the trivial group.
+        origin: ``extrinsic``, ``file``, ``transfer`` or ``none``.
+        warnings: what is doubtful, with the numbers.
+        details: numbers for the summary.
+    """
+
+    group: SymmetryGroup
+    sign: Float[Tensor, " V"]
+    origin: str
+    warnings: list[str] = field(default_factory=list)
+    details: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def known(self) -> bool:
+        """Whether there is more than the identity."""
+        return self.group.order > 1
+
+
+def no_symmetry(shape: PreparedShape, warnings: list[str] | None = None) -> KnownSymmetry:
+    """The trivial group: the shape goes through the same code and gives one map."""
+    group = SymmetryGroup.trivial(shape.n_verts)
+    return KnownSymmetry(group, torch.zeros(shape.n_verts, dtype=torch.float64), "none", warnings or [])
+
+
+def extrinsic_symmetry(shape: PreparedShape, max_residual: float = 0.03) -> KnownSymmetry:
+    """The reflection in the best mirror plane, if the shape is its own mirror image up to ``max_residual``.
+
+    Args:
+        shape: the shape.
+        max_residual: root mean square distance to the mirror image / sqrt(area) above which there is no plane.
+
+    Returns:
+        The reflection, with a warning if its residual is more than the triangulation explains; above ``max_residual``
+        the trivial group, with a warning that gives the residual.
+
+    References:
+        Paper, sections 6.2 and 7.
+    """
+    found = find_reflection(shape.mesh)
+    numbers = f"rms {found.residual:.4f}, max {found.residual_max:.4f} of sqrt(area); vertex spacing {found.spacing:.4f}"
+    details = {
+        "residual": found.residual,
+        "residual_max": found.residual_max,
+        "spacing": found.spacing,
+        "normal": found.normal.tolist(),
+    }
+    name = shape.mesh.label
+    if found.residual > max_residual:
+        text = f"{name}: no mirror plane: the best one leaves a residual above {max_residual:g} ({numbers})"
+        return KnownSymmetry(SymmetryGroup.trivial(shape.n_verts), torch.zeros_like(shape.basis.mass), "none", [text], details)
+    warnings = []
+    if not found.convincing:
+        warnings.append(f"{name}: the mirror plane fits only roughly ({numbers})")
+    sign = torch.sign(found.side(shape.mesh.verts))
+    return KnownSymmetry(SymmetryGroup.from_reflection(found.map), sign, "extrinsic", warnings, details)
+
+
+def given_symmetry(shape: PreparedShape, maps: Int[Tensor, "G V"], origin: str = "file") -> KnownSymmetry:
+    """A symmetry handed in as a table of vertex maps, row 0 the identity; left and right are found by clustering.
+
+    Raises:
+        ValueError: wrong length or ids, row 0 is not the identity, more than one reflection, or a map that is not an
+            involution: applied twice, it must bring each point back to within a tenth of sqrt(area) on average.
+    """
+    if maps.shape[1] != shape.n_verts:
+        raise ValueError(
+            f"the symmetry has {maps.shape[1]} entries a row, but {shape.mesh.label} has {shape.n_verts} vertices"
+        )
+    group = SymmetryGroup(maps)
+    if group.order == 1:
+        return KnownSymmetry(group, torch.zeros_like(shape.basis.mass), origin)
+    if group.order > 2:
+        raise ValueError(
+            f"{shape.mesh.label}: the symmetry has {group.order} elements; dense maps are extracted for one reflection "
+            "(2 elements) so far"
+        )
+    verts = shape.mesh.verts
+    back = group.maps[1][group.maps[1]]
+    error = float(((verts - verts[back]).norm(dim=1) * shape.basis.mass).sum())
+    if error > 0.1:
+        raise ValueError(
+            f"{shape.mesh.label}: row 1 of the symmetry is no reflection: applied twice it moves points by {error:.3f} "
+            "sqrt(area) on average (0 is exact, 0.1 is allowed)"
+        )
+    halves = persistence_clusters(shape.mesh, displacement(shape.mesh, group.maps[1], "extrinsic"))
+    warnings = [f"{shape.mesh.label}: {halves.warning}"] if halves.warning else []
+    return KnownSymmetry(group, halves.sign, origin, warnings, {"involution_error": error})
+
+
+def transferred_symmetry(
+    shape: PreparedShape, reference: PreparedShape, known: KnownSymmetry, parameters: MatchParameters, way: str
+) -> KnownSymmetry:
+    """The symmetry of a shape from a reference whose reflection is known; see :func:`torchqm.matching.transfer.transfer_symmetry`."""
+    moved = transfer_symmetry(shape, reference, known.group, known.sign, parameters, way)
+    details: dict[str, Any] = {"reference": reference.mesh.label, "way": way}
+    if moved.odd is not None:
+        details |= {"residual_direct": moved.odd.residual_direct, "residual_mirrored": moved.odd.residual_mirrored}
+    if moved.halves is not None:
+        details |= {
+            "persistence": list(moved.halves.persistence[:4]),
+            "margin": moved.halves.margin,
+            "balance": moved.halves.balance,
+        }
+    warnings = [f"{shape.mesh.label}: {text}" for text in moved.warnings]
+    return KnownSymmetry(moved.group, moved.sign, "transfer", warnings, details)

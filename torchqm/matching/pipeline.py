@@ -1,0 +1,317 @@
+"""From two meshes to all the equally good dense maps, and the same for a collection of poses (paper, section 6.2)."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchqm.fmap.convert import fmap_to_p2p, p2p_to_fmap
+from torchqm.fmap.refine import correspondence_fmap
+from torchqm.geometry.check import check_mesh
+from torchqm.geometry.io import load_mesh
+from torchqm.geometry.mesh import Mesh
+from torchqm.matching.known import (
+    KnownSymmetry,
+    extrinsic_symmetry,
+    given_symmetry,
+    no_symmetry,
+    transferred_symmetry,
+)
+from torchqm.matching.parameters import MatchParameters
+from torchqm.matching.quality import commutativity_score, orientation_agreement
+from torchqm.matching.quotient import choose_halves, match_quotient, refine_by_icp, refine_by_odd_block, upsample_to
+from torchqm.matching.result import MatchResult, SymmetryResult
+from torchqm.matching.semi_quotient import match_semi_quotient
+from torchqm.matching.shape import PreparedShape, prepare
+from torchqm.matching.steps import StepListener, Steps
+
+__all__ = ["METHODS", "Collection", "find_symmetry", "match", "match_prepared"]
+
+METHODS = ("quotient", "paper", "semi")
+
+# Expected seconds per step and 1000 vertices, for the share of work done; measured once, only their ratios matter.
+_COST = {"eigenpairs": 1.0, "symmetry": 0.5, "quotient": 0.3, "maps": 1.5}
+
+
+def match(
+    source: Mesh | str | Path,
+    target: Mesh | str | Path,
+    *,
+    symmetry: str | Tensor = "extrinsic",
+    symmetry_source: Tensor | None = None,
+    reference: Mesh | str | Path | None = None,
+    method: str = "quotient",
+    parameters: MatchParameters | None = None,
+    listener: StepListener | None = None,
+) -> MatchResult:
+    """All the equally good dense maps from one shape to another.
+
+    The symmetry of at least one shape must be known. With ``symmetry='extrinsic'`` a mirror plane is looked for in the
+    reference if there is one, else in both shapes; a shape without plane gets its symmetry by transfer from one that has
+    it (sections 5 and 6.1). Then the two are matched in the quotient (section 4).
+
+    Args:
+        source: a mesh or its file.
+        target: a mesh or its file.
+        symmetry: ``extrinsic``, ``none``, or the target's symmetry as ``(G, V_target)`` vertex maps, row 0 the identity.
+        symmetry_source: the source's symmetry as vertex maps, if known; else it is found.
+        reference: an undeformed pose of the same shape, whose mirror plane gives both shapes their symmetry.
+        method: ``quotient`` (default; what measured best), ``paper`` (sections 4 to 7 as printed) or ``semi`` (section 5
+            alone: the symmetry of the source is used only to choose between the two points of an orbit).
+        parameters: numbers of the method; by default those that belong to ``method``.
+        listener: told of each step; see :data:`torchqm.matching.steps.StepListener`.
+
+    Returns:
+        The maps, source vertex to target vertex, with labels, scores, functional maps, warnings and timings.
+
+    Raises:
+        MeshError: a file or mesh that cannot be used; the message names it and its fault.
+        SpectrumError: fewer vertices than eigenfunctions.
+        ValueError: an unknown method or symmetry, or a symmetry that does not fit.
+
+    References:
+        Paper, Algorithm 1 and sections 5 to 7.
+    """
+    collection = Collection(reference, method, parameters, listener)
+    return collection.match(source, target, symmetry, symmetry_source)
+
+
+def find_symmetry(
+    mesh: Mesh | str | Path,
+    *,
+    reference: Mesh | str | Path | None = None,
+    parameters: MatchParameters | None = None,
+    listener: StepListener | None = None,
+    method: str = "quotient",
+) -> SymmetryResult:
+    """The reflection of a shape: from its own mirror plane, or transferred from an undeformed reference.
+
+    Args:
+        mesh: the shape.
+        reference: another pose of it that has a mirror plane; without it the shape's own plane is looked for.
+        parameters: of the matching.
+        listener: told of each step.
+        method: whose way of transfer: ``quotient`` or ``paper``.
+
+    Returns:
+        The group; trivial, with a warning that gives the residual, if no plane was found.
+    """
+    collection = Collection(reference, method, parameters, listener)
+    shape = collection.shape(mesh)
+    known = collection.symmetry(shape)
+    scores = [commutativity_score(m, shape.basis, shape.basis) for m in known.group.maps]
+    agreement = [orientation_agreement(shape.mesh, shape.mesh, m) for m in known.group.maps]
+    labels = [_label(a) if shape.oriented else "unknown" for a in agreement]
+    return SymmetryResult(
+        known.group.maps,
+        ("direct", *labels[1:]),
+        torch.tensor(scores, dtype=torch.float64),
+        known.origin,
+        [*shape.warnings, *known.warnings],
+        collection.parameters.as_dict(),
+        dict(collection.steps.seconds),
+        {**known.details, "orientation": agreement},
+    )
+
+
+class Collection:
+    """Poses of one shape: each mesh is prepared once, its symmetry found once, and any two are matched (section 6.2).
+
+    Args:
+        reference: an undeformed pose with a mirror plane; None if the shapes have planes of their own.
+        method: one of :data:`METHODS`.
+        parameters: by default those of the method.
+        listener: told of each step.
+        cost: expected work, for the share of it that the listener is told.
+    """
+
+    def __init__(
+        self,
+        reference: Mesh | str | Path | None = None,
+        method: str = "quotient",
+        parameters: MatchParameters | None = None,
+        listener: StepListener | None = None,
+    ) -> None:
+        if method not in METHODS:
+            raise ValueError(f"method={method!r}: allowed are {', '.join(METHODS)}")
+        self.method = method
+        self.parameters = parameters or (MatchParameters() if method == "quotient" else MatchParameters.paper())
+        self.steps = Steps(listener=listener)
+        self.way = "full_map" if method == "quotient" else "clustering"
+        self._shapes: dict[int, tuple[Mesh, PreparedShape]] = {}
+        self._symmetries: dict[int, KnownSymmetry] = {}
+        self._reference = None if reference is None else _as_mesh(reference)
+
+    def shape(self, mesh: Mesh | str | Path | PreparedShape) -> PreparedShape:
+        """The mesh made ready: checked, scaled to unit area, with its eigenpairs."""
+        if isinstance(mesh, PreparedShape):
+            return mesh
+        mesh = _as_mesh(mesh)
+        if id(mesh) not in self._shapes:
+            with self.steps(f"eigenpairs of {mesh.name}", _COST["eigenpairs"] * mesh.n_verts / 1000):
+                k = self.parameters.k_max
+                prepared = prepare(mesh, k, self.parameters.n_samples, self.parameters.seed)
+            self._shapes[id(mesh)] = (mesh, prepared)  # the mesh is kept so that its id stays its own
+        return self._shapes[id(mesh)][1]
+
+    def symmetry(self, shape: PreparedShape) -> KnownSymmetry:
+        """The shape's symmetry: from the reference if there is one, else from its own mirror plane."""
+        if id(shape) not in self._symmetries:
+            if self._reference is None or self.shape(self._reference) is shape:
+                with self.steps(f"mirror plane of {shape.mesh.name}"):
+                    known = extrinsic_symmetry(shape)
+            else:
+                reference = self.shape(self._reference)
+                known = self.transfer(shape, reference, self.symmetry(reference))
+            self._symmetries[id(shape)] = known
+        return self._symmetries[id(shape)]
+
+    def transfer(self, shape: PreparedShape, reference: PreparedShape, known: KnownSymmetry) -> KnownSymmetry:
+        """A shape's symmetry by transfer from another; trivial if that has none."""
+        if not known.known:
+            return no_symmetry(shape, list(known.warnings))
+        with self.steps(f"symmetry transfer to {shape.mesh.name}", _COST["symmetry"] * shape.n_verts / 1000):
+            return transferred_symmetry(shape, reference, known, self.parameters, self.way)
+
+    def match(
+        self,
+        source: Mesh | str | Path | PreparedShape,
+        target: Mesh | str | Path | PreparedShape,
+        symmetry: str | Tensor = "extrinsic",
+        symmetry_source: Tensor | None = None,
+    ) -> MatchResult:
+        """Match two poses; arguments and result as in :func:`match`."""
+        meshes = [m if isinstance(m, PreparedShape) else _as_mesh(m) for m in (source, target)]
+        self.steps.total = self.steps.done + self._expected(meshes)
+        x, y = (self.shape(m) for m in meshes)
+        known_x, known_y = self._both(x, y, symmetry, symmetry_source)
+        return match_prepared(x, y, known_x, known_y, self.method, self.parameters, self.steps)
+
+    def _both(
+        self, x: PreparedShape, y: PreparedShape, symmetry: str | Tensor, symmetry_source: Tensor | None
+    ) -> tuple[KnownSymmetry, KnownSymmetry]:
+        """The symmetries of two shapes, each transferred from the other where only one has its own."""
+        known_x = None if symmetry_source is None else given_symmetry(x, symmetry_source)
+        if isinstance(symmetry, Tensor):
+            known_y = given_symmetry(y, symmetry)
+        elif symmetry == "none":
+            return no_symmetry(x), no_symmetry(y)
+        elif symmetry == "extrinsic":
+            known_y = self.symmetry(y)
+        else:
+            raise ValueError(f"symmetry={symmetry!r}: allowed are 'extrinsic', 'none' or a table of vertex maps")
+        if known_x is None and (isinstance(symmetry, str) or self.method != "semi"):
+            known_x = self.symmetry(x)
+        if known_x is None or (known_y.known and not known_x.known):
+            known_x = self.transfer(x, y, known_y)
+        elif known_x.known and not known_y.known:
+            known_y = self.transfer(y, x, known_x)
+        return known_x, known_y
+
+    def _expected(self, meshes: list[Any]) -> float:
+        """Expected work of a match, in the unit of ``_COST``: eigenpairs of meshes not yet prepared, then the rest."""
+        sizes = [m.n_verts for m in meshes]
+        new = [m for m in [*meshes, self._reference] if isinstance(m, Mesh) and id(m) not in self._shapes]
+        work = _COST["eigenpairs"] * sum(m.n_verts for m in new) + _COST["symmetry"] * sum(sizes)
+        return (work + (_COST["quotient"] + _COST["maps"]) * sizes[0]) / 1000
+
+
+def match_prepared(
+    x: PreparedShape,
+    y: PreparedShape,
+    known_x: KnownSymmetry,
+    known_y: KnownSymmetry,
+    method: str = "quotient",
+    parameters: MatchParameters | None = None,
+    steps: Steps | None = None,
+) -> MatchResult:
+    """Match two prepared shapes with known symmetries; see :func:`match`."""
+    parameters = parameters or MatchParameters()
+    steps = steps or Steps()
+    warnings = list(dict.fromkeys([*x.warnings, *y.warnings, *known_x.warnings, *known_y.warnings]))
+    if known_x.group.order != known_y.group.order:
+        warnings.append(
+            f"the groups differ ({known_x.group.order} and {known_y.group.order} elements): matched with the identity alone"
+        )
+        known_x, known_y = no_symmetry(x), no_symmetry(y)
+    details: dict[str, Any] = {
+        "source": {"name": x.mesh.label, "vertices": x.n_verts, "laplacian": x.operator, "symmetry": known_x.origin}
+        | known_x.details,
+        "target": {"name": y.mesh.label, "vertices": y.n_verts, "laplacian": y.operator, "symmetry": known_y.origin}
+        | known_y.details,
+    }
+    if not known_x.known:
+        warnings.append("no symmetry is used: of several equally good maps one comes back, possibly a mixture of them")
+    work = x.n_verts / 1000
+    oriented = x.oriented and y.oriented
+    separated = None
+    if method == "semi":
+        with steps("semi-quotient matching", _COST["quotient"] * work):
+            semi = match_semi_quotient(x, y, known_y.group, parameters)
+            even, p2p, fmap = semi.fmap, semi.orbit_map, None
+            if known_y.known:
+                p2p = choose_halves(p2p, known_y.group, known_x.sign, known_y.sign)
+    else:
+        with steps("quotient matching", _COST["quotient"] * work):
+            found = match_quotient(x, y, known_x.group, known_y.group, parameters)
+        even = found.fmap
+        with steps("point maps and refinement", _COST["maps"] * work):
+            if not known_x.known:
+                fmap = upsample_to(found.fmap, x, y, parameters)
+            elif method == "quotient" and oriented:
+                fmap, odd = refine_by_odd_block(found, x, y, parameters)
+                details |= {"residual_direct": odd.residual_direct, "residual_mirrored": odd.residual_mirrored}
+                separated = odd.separated
+            else:
+                halves = choose_halves(found.orbit_map, known_y.group, known_x.sign, known_y.sign)
+                fmap = refine_by_icp(halves, x, y, parameters)
+            p2p = fmap_to_p2p(fmap, x.basis.truncate(fmap.shape[1]), y.basis.truncate(fmap.shape[0]))
+    with steps("scores and labels"):
+        if fmap is None:
+            k = parameters.k
+            fmap = correspondence_fmap(p2p, x.basis.truncate(k), y.basis.truncate(k), x.samples)
+        maps = known_y.group.maps[:, p2p]
+        agreement = [orientation_agreement(x.mesh, y.mesh, m) for m in maps]
+        labels = [_label(a) if oriented else "unknown" for a in agreement]
+        if not oriented:
+            warnings.append("a mesh is not consistently orientable: direct and mirrored cannot be told apart")
+        elif separated is False or "unknown" in labels:
+            labels = ["unknown"] * len(labels)
+            numbers = {n: round(v, 2) for n, v in details.items() if n.startswith("residual")}
+            warnings.append(
+                f"direct and mirrored are not told apart: orientation agreement {[round(a, 2) for a in agreement]}"
+                + (f", residuals {numbers}" if numbers else "")
+            )
+        basis_y = y.basis.truncate(fmap.shape[0])
+        fmaps = torch.stack([p2p_to_fmap(m, basis_y, basis_y) @ fmap for m in known_y.group.maps])
+        scores = torch.tensor([commutativity_score(m, x.basis, y.basis) for m in maps], dtype=torch.float64)
+    order = sorted(range(len(labels)), key=lambda g: ("direct", "unknown", "mirrored").index(labels[g]))
+    return MatchResult(
+        maps=maps[order],
+        labels=tuple(labels[g] for g in order),
+        scores=scores[order],
+        orbits=maps[order].T.contiguous(),
+        fmaps=fmaps[order],
+        fmap_even=even,
+        symmetry_source=known_x.group.maps,
+        symmetry_target=known_y.group.maps,
+        orientation=torch.tensor(agreement, dtype=torch.float64)[order],
+        method=method,
+        warnings=warnings,
+        parameters=parameters.as_dict(),
+        seconds=dict(steps.seconds),
+        details=details,
+    )
+
+
+def _label(agreement: float) -> str:
+    """Name of a map by its orientation agreement; a map that is right on three quarters of the area has 0.5."""
+    return "direct" if agreement > 0.3 else "mirrored" if agreement < -0.3 else "unknown"
+
+
+def _as_mesh(mesh: Mesh | str | Path) -> Mesh:
+    """Load a file, or take a mesh as it is, and refuse what cannot be matched."""
+    loaded = mesh if isinstance(mesh, Mesh) else load_mesh(mesh)
+    check_mesh(loaded)
+    return loaded

@@ -1,0 +1,46 @@
+"""What a map says about itself, without any ground truth: commutativity and orientation."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchqm.fmap.convert import p2p_to_fmap
+from torchqm.geometry.mesh import Mesh
+from torchqm.spectral.basis import SpectralBasis
+
+__all__ = ["commutativity_score", "orientation_agreement"]
+
+
+def commutativity_score(
+    p2p_xy: Int[Tensor, " Vx"], basis_x: SpectralBasis, basis_y: SpectralBasis, k: int = 50
+) -> float:
+    """``|| C Delta - Delta C || / (|| C Delta || + || Delta C ||)`` of the pull-back along a point map; 0 is an isometry.
+
+    Args:
+        p2p_xy: for each vertex of x a vertex of y; its pull-back takes functions on y to functions on x.
+        basis_x: full basis of x.
+        basis_y: full basis of y.
+        k: functions of each to use, at most.
+    """
+    k = min(k, basis_x.k, basis_y.k)
+    small_x, small_y = basis_x.truncate(k), basis_y.truncate(k)
+    fmap_yx = p2p_to_fmap(p2p_xy, small_y, small_x)
+    right, left = fmap_yx * small_y.evals, small_x.evals[:, None] * fmap_yx
+    return float((right - left).norm() / (right.norm() + left.norm()).clamp_min(1e-300))
+
+
+def orientation_agreement(mesh_x: Mesh, mesh_y: Mesh, p2p_xy: Int[Tensor, " Vx"]) -> float:
+    """Area-weighted mean over triangles of +1 where a point map keeps orientation and -1 where it turns it over.
+
+    A triangle of x is compared with the normal of y at the image of its first corner; triangles whose image has no area
+    say nothing. Both meshes must be consistently oriented, with normals outward.
+    """
+    corners = p2p_xy[mesh_x.faces]
+    a, b, c = mesh_y.verts[corners].unbind(1)
+    image = torch.linalg.cross(b - a, c - a)
+    normals = torch.zeros_like(mesh_y.verts)
+    for corner in range(3):
+        normals.index_add_(0, mesh_y.faces[:, corner], mesh_y.face_vectors)
+    sign = torch.sign((image * normals[corners[:, 0]]).sum(1))
+    weight = mesh_x.face_areas * (sign != 0)
+    return float((sign * weight).sum() / weight.sum().clamp_min(1e-300))

@@ -1,0 +1,139 @@
+"""Quotient-space matching of two shapes with known symmetry (paper, section 4, Algorithm 1)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchqm.fmap.convert import fmap_to_p2p
+from torchqm.fmap.refine import correspondence_fmap, quotient_icp, upsample, upsampling_sizes
+from torchqm.matching.initial import initial_fmap, shared_descriptors
+from torchqm.matching.odd import OddMap, join_blocks, solve_odd
+from torchqm.matching.parameters import MatchParameters
+from torchqm.matching.shape import PreparedShape
+from torchqm.symmetry.basis import SymmetrizedBasis, symmetrized_basis
+from torchqm.symmetry.group import SymmetryGroup
+
+__all__ = ["QuotientMatch", "choose_halves", "match_quotient", "refine_by_icp", "refine_by_odd_block"]
+
+
+@dataclass(frozen=True, eq=False)
+class QuotientMatch:
+    """The map between symmetric functions: the same for all the isometries between the shapes (paper, Lemma 3.2).
+
+    Args:
+        source: the source's basis, split.
+        target: the target's basis, split.
+        fmap: ``(K+_y, K+_x)`` the even block C+.
+        orbit_map: ``(V_source,)`` a target vertex whose orbit is the image; which point of the orbit is arbitrary.
+    """
+
+    source: SymmetrizedBasis
+    target: SymmetrizedBasis
+    fmap: Float[Tensor, "Key Kex"]
+    orbit_map: Int[Tensor, " Vx"]
+
+
+def match_quotient(
+    x: PreparedShape, y: PreparedShape, group_x: SymmetryGroup, group_y: SymmetryGroup, parameters: MatchParameters
+) -> QuotientMatch:
+    """Algorithm 1 up to the point-to-orbit map: bases of L2+, descriptors, commutativity, least squares, quotient-ICP.
+
+    Args:
+        x: source.
+        y: target.
+        group_x: symmetry group of the source.
+        group_y: symmetry group of the target.
+        parameters: ``k``, descriptors, ``commutativity``, ``icp_steps``, ``time``, ``n_samples`` are used.
+
+    References:
+        Paper, section 4.3 and 4.4.
+    """
+    source = symmetrized_basis(x.basis.truncate(parameters.k), group_x)
+    target = symmetrized_basis(y.basis.truncate(parameters.k), group_y)
+    values_x, values_y = shared_descriptors([x.basis, y.basis], parameters)
+    fmap = initial_fmap(source.even, target.even, values_x, values_y, parameters.commutativity)
+    samples = x.samples[: parameters.n_samples]
+    fmap = quotient_icp(fmap, source.even, target.even, samples, parameters.icp_steps, parameters.time)
+    orbit_map = fmap_to_p2p(fmap, source.even, target.even, parameters.time)
+    return QuotientMatch(source, target, fmap, orbit_map)
+
+
+def choose_halves(
+    orbit_map: Int[Tensor, " Vx"],
+    group_y: SymmetryGroup,
+    sign_x: Float[Tensor, " Vx"],
+    sign_y: Float[Tensor, " Vy"],
+) -> Int[Tensor, " Vx"]:
+    """From point-to-orbit to point-to-point: of the orbit of ``T(x)`` take the point in the half that belongs to x's.
+
+    Vertices on an axis (sign 0), or whose orbit has no point in the wanted half, keep the point they have.
+
+    Args:
+        orbit_map: for each vertex of x a vertex of y.
+        group_y: ``{id, S}`` of y.
+        sign_x: left-right map of x, -1 and +1.
+        sign_y: left-right map of y; swap its sign for the second consistent map.
+
+    Raises:
+        ValueError: the group has other than two elements; fundamental domains of more need more than a sign.
+
+    References:
+        Paper, section 4.4, fundamental domains; section 6.2, step 3.
+    """
+    if group_y.order != 2:
+        raise ValueError(f"group_y has {group_y.order} elements; left and right are halves of a single reflection")
+    other = group_y.maps[1][orbit_map]
+    swap = (sign_y[orbit_map] != sign_x) & (sign_y[other] == sign_x) & (sign_x != 0)
+    return torch.where(swap, other, orbit_map)
+
+
+def refine_by_icp(
+    p2p_xy: Int[Tensor, " Vx"], x: PreparedShape, y: PreparedShape, parameters: MatchParameters
+) -> Float[Tensor, "K K"]:
+    """The paper's last step: the point map as a functional map at k = 100, ICP there (5 steps) and at k = 300 (3 steps).
+
+    Smaller bases are used as far as ``k_max`` allows.
+
+    References:
+        Paper, section 7.4; Ovsjanikov et al. 2012, section 8.1.
+    """
+    samples = x.samples[: parameters.n_samples]
+    k_max = min(parameters.k_max, x.basis.k, y.basis.k)
+    k = min(100, k_max)
+    fmap = correspondence_fmap(p2p_xy, x.basis.truncate(k), y.basis.truncate(k), samples)
+    fmap = upsample(fmap, x.basis, y.basis, samples, [k], steps=5)
+    return upsample(fmap, x.basis, y.basis, samples, [k_max], steps=3) if k_max > k else fmap
+
+
+def refine_by_odd_block(
+    match: QuotientMatch, x: PreparedShape, y: PreparedShape, parameters: MatchParameters
+) -> tuple[Float[Tensor, "K K"], OddMap]:
+    """The odd block from orientation, joined with the even one, and the full map refined by spectral upsampling.
+
+    Args:
+        match: the even block at ``parameters.k``.
+        x: source, consistently oriented.
+        y: target, likewise.
+        parameters: ``k_max``, ``upsample_step``, ``n_samples`` are used.
+
+    Returns:
+        The orientation-preserving functional map at ``k_max``, and the odd block with its two residuals.
+    """
+    odd = solve_odd(
+        x.mesh, y.mesh, match.source.even, match.target.even, match.fmap, match.source.odd, match.target.odd
+    )
+    fmap = join_blocks(match.source, match.target, match.fmap, odd.fmap)
+    return upsample_to(fmap, x, y, parameters), odd
+
+
+def upsample_to(
+    fmap: Float[Tensor, "K0 K0"], x: PreparedShape, y: PreparedShape, parameters: MatchParameters
+) -> Float[Tensor, "K K"]:
+    """Spectral upsampling from where a map stands to ``k_max``; nothing where ``refinement`` is ``none``."""
+    k_max = min(parameters.k_max, x.basis.k, y.basis.k)
+    if parameters.refinement == "none" or k_max <= fmap.shape[0]:
+        return fmap
+    sizes = upsampling_sizes(fmap.shape[0], k_max, parameters.upsample_step)
+    return upsample(fmap, x.basis, y.basis, x.samples[: parameters.n_samples], sizes)

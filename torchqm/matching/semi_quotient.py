@@ -1,0 +1,106 @@
+"""Semi-quotient matching: the symmetry is known on the target only (paper, section 5)."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchqm.fmap.convert import fmap_to_p2p
+from torchqm.fmap.refine import nearest_isometry, semi_quotient_icp, semi_upsample, upsampling_sizes
+from torchqm.matching.initial import initial_fmap, shared_descriptors
+from torchqm.matching.parameters import MatchParameters
+from torchqm.matching.shape import PreparedShape
+from torchqm.symmetry.basis import SymmetrizedBasis, split_by_projector, symmetrized_basis
+from torchqm.symmetry.group import SymmetryGroup
+
+__all__ = ["SemiQuotientMatch", "match_semi_quotient", "pull_back", "sharpen_orbit_map"]
+
+
+@dataclass(frozen=True, eq=False)
+class SemiQuotientMatch:
+    """A map from all functions on the source to the symmetric functions on the target.
+
+    Args:
+        fmap: ``(K+_y, k)`` with orthonormal rows: ``R = pi+ o T``.
+        target: the target's basis split by its known symmetry.
+        source: the source's basis split by what the map says: L2+ of the source is the complement of the kernel of R.
+        even: ``(K+_y, K+_x)``, R restricted to that L2+: a square isometry.
+        orbit_map: ``(V_source,)`` for each source vertex a target vertex; its *orbit* is the image. Which point of the
+            orbit stands here is arbitrary and may differ between neighbours.
+    """
+
+    fmap: Float[Tensor, "Key Kx"]
+    target: SymmetrizedBasis
+    source: SymmetrizedBasis
+    even: Float[Tensor, "Key Kex"]
+    orbit_map: Int[Tensor, " Vx"]
+
+
+def match_semi_quotient(
+    x: PreparedShape, y: PreparedShape, group_y: SymmetryGroup, parameters: MatchParameters
+) -> SemiQuotientMatch:
+    """Match a shape without known symmetry to one whose symmetry group is given.
+
+    Descriptors and commutativity give the initial ``k/2 x k`` matrix in least squares; semi-quotient ICP refines it.
+
+    Args:
+        x: source; nothing is known of its symmetry.
+        y: target.
+        group_y: symmetry group of the target.
+        parameters: ``k``, descriptors, ``icp_steps``, ``semi_width``, ``time`` are used.
+
+    References:
+        Paper, section 5 and Lemma 5.1.
+    """
+    basis_x = x.basis.truncate(parameters.k)
+    target = symmetrized_basis(y.basis.truncate(parameters.k), group_y)
+    values_x, values_y = shared_descriptors([x.basis, y.basis], parameters)
+    fmap = initial_fmap(basis_x, target.even, values_x, values_y, parameters.commutativity)
+    samples = x.samples[: parameters.n_samples]
+    fmap = semi_quotient_icp(
+        fmap, basis_x, target.even, samples, parameters.icp_steps, parameters.time, parameters.semi_width
+    )
+    fmap = nearest_isometry(fmap)
+    source = split_by_projector(basis_x, fmap.T @ fmap)
+    orbit_map = fmap_to_p2p(fmap, basis_x, target.even, parameters.time)
+    return SemiQuotientMatch(fmap, target, source, fmap @ source.even_coeffs, orbit_map)
+
+
+def sharpen_orbit_map(
+    semi: SemiQuotientMatch,
+    x: PreparedShape,
+    y: PreparedShape,
+    group_y: SymmetryGroup,
+    parameters: MatchParameters,
+    k: int = 100,
+) -> Int[Tensor, " Vx"]:
+    """A point-to-orbit map from more functions: the semi-quotient map upsampled to ``k`` of the source.
+
+    Args:
+        semi: the match at ``parameters.k``.
+        x: source.
+        y: target.
+        group_y: symmetry of the target.
+        parameters: ``upsample_step``, ``n_samples`` and ``semi_width`` are used.
+        k: functions of the source to reach.
+
+    Returns:
+        ``(Vx,)``, as ``semi.orbit_map``.
+    """
+    k = min(k, x.basis.k)
+    even_y = symmetrized_basis(y.basis.truncate(min(k + k // 5, y.basis.k)), group_y).even
+    sizes = upsampling_sizes(semi.fmap.shape[1], k, parameters.upsample_step)
+    fmap = semi_upsample(
+        semi.fmap, x.basis, even_y, x.samples[: parameters.n_samples], [*sizes, k], parameters.semi_width
+    )
+    return fmap_to_p2p(fmap, x.basis.truncate(fmap.shape[1]), even_y.truncate(fmap.shape[0]))
+
+
+def pull_back(values: Float[Tensor, "Vy C"], orbit_map: Int[Tensor, " Vx"]) -> Float[Tensor, "Vx C"]:
+    """Bring symmetric functions of the target to the source: ``f(x) = g(R(x))`` (paper, section 5, function transfer).
+
+    The pseudo-inverse of R would do it in the span of k functions only; through the point-to-orbit map nothing is lost.
+    The functions must be symmetric, else the arbitrary choice within an orbit shows.
+    """
+    return values[orbit_map]
+

@@ -1,0 +1,81 @@
+"""A mesh made ready for matching: unit area, eigenbasis, samples; what is computed once a shape and used by every pair."""
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from torchqm.geometry.check import MeshReport, inspect_mesh, orient_faces
+from torchqm.geometry.laplacian import laplacian
+from torchqm.geometry.mesh import Mesh
+from torchqm.geometry.sampling import area_samples
+from torchqm.spectral.basis import SpectralBasis
+from torchqm.spectral.eigen import eigenbasis
+
+__all__ = ["PreparedShape", "prepare"]
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedShape:
+    """What matching needs to know of one shape.
+
+    Args:
+        mesh: scaled to total area 1.
+        basis: its first eigenpairs, in the same scale.
+        samples: ``(S,)`` vertex ids drawn by area without replacement.
+        scale: sqrt of the original area: lengths of ``mesh`` times this are lengths of the file.
+        operator: ``cotan`` or ``robust``, and why it was chosen.
+        oriented: whether ``mesh`` is consistently oriented (normals outward); if not, direct and mirrored are the same.
+        warnings: what was odd about the mesh and how it was handled.
+    """
+
+    mesh: Mesh
+    basis: SpectralBasis
+    samples: Int[Tensor, " S"]
+    scale: float = 1.0
+    operator: str = ""
+    oriented: bool = True
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def n_verts(self) -> int:
+        """Number of vertices."""
+        return self.mesh.n_verts
+
+
+def prepare(mesh: Mesh, k: int = 200, n_samples: int = 4000, seed: int = 0, kind: str = "auto") -> PreparedShape:
+    """Scale a mesh to unit area and compute its first ``k`` eigenpairs.
+
+    Args:
+        mesh: a checked mesh (:func:`torchqm.geometry.check.check_mesh`).
+        k: number of eigenpairs.
+        n_samples: how many vertices stand for the surface in refinement steps.
+        seed: of the samples.
+        kind: Laplacian, see :func:`torchqm.geometry.laplacian.laplacian`.
+
+    Raises:
+        SpectrumError: fewer than ``k`` vertices with area.
+    """
+    report = inspect_mesh(mesh)
+    operator = laplacian(mesh.normalized(), kind, report)
+    unit, oriented, warnings = _outward(mesh, report)
+    basis = eigenbasis(operator, k, mesh.label)
+    samples = area_samples(unit, min(n_samples, int((unit.vertex_areas > 0).sum())), seed)
+    warnings = [f"{mesh.label}: {text}" for text in [*report.warnings, *warnings]]
+    return PreparedShape(unit, basis, samples, mesh.area**0.5, f"{operator.kind}: {operator.reason}", oriented, warnings)
+
+
+def _outward(mesh: Mesh, report: MeshReport) -> tuple[Mesh, bool, list[str]]:
+    """Unit-area mesh with cleaned, consistently oriented triangles, normals outward where that has a meaning."""
+    faces = orient_faces(mesh)
+    if faces is None:
+        return mesh.normalized(), False, ["the surface is not orientable"]
+    turned = replace(mesh, faces=faces).normalized()
+    warnings = [] if report.oriented else ["some triangles were turned over so that neighbours agree"]
+    # Volume of the cone over each triangle from the centroid: negative in total if the surface is inside out.
+    volume = float((turned.verts[turned.faces[:, 0]] * turned.face_vectors).sum() / 6)
+    if volume < 0:
+        turned = replace(turned, faces=turned.faces.flip(1))
+        warnings.append("the surface was inside out: all triangles were turned over")
+    return turned, True, warnings

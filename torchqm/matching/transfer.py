@@ -1,0 +1,220 @@
+"""Symmetry transfer: from a reference shape with a known reflection to another pose of it (paper, section 6.1)."""
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchqm.fmap.convert import fmap_to_p2p
+from torchqm.fmap.refine import quotient_icp, upsample, upsampling_sizes
+from torchqm.fmap.solve import solve_fmap
+from torchqm.matching.initial import shared_descriptors, unit_columns_pair
+from torchqm.matching.odd import OddMap, join_blocks, solve_odd
+from torchqm.matching.parameters import MatchParameters
+from torchqm.matching.semi_quotient import SemiQuotientMatch, match_semi_quotient, pull_back, sharpen_orbit_map
+from torchqm.matching.shape import PreparedShape
+from torchqm.spectral.basis import SpectralBasis
+from torchqm.symmetry.group import SymmetryGroup
+from torchqm.symmetry.leftright import LeftRight, displacement, persistence_clusters
+
+__all__ = [
+    "SymmetryTransfer",
+    "halves_by_clustering",
+    "halves_by_full_map",
+    "nearest_involution",
+    "self_map_from_halves",
+    "transfer_symmetry",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class SymmetryTransfer:
+    """The symmetry of a shape as it came over from a reference.
+
+    Args:
+        group: ``{id, S}`` of the source, as vertex maps.
+        sign: ``(V,)`` its left-right map: -1, +1, 0 where undecided.
+        fmap: ``(k, k)`` the functional map of S in the source's first k eigenfunctions.
+        semi: the semi-quotient match that it came from.
+        halves: the clustering, if that was the way.
+        odd: the odd block of the map to the reference, if that was the way.
+        warnings: assumptions that did not hold, with numbers.
+    """
+
+    group: SymmetryGroup
+    sign: Float[Tensor, " V"]
+    fmap: Float[Tensor, "K K"]
+    semi: SemiQuotientMatch
+    halves: LeftRight | None = None
+    odd: OddMap | None = None
+    warnings: list[str] = field(default_factory=list)
+
+
+def transfer_symmetry(
+    x: PreparedShape,
+    y: PreparedShape,
+    group_y: SymmetryGroup,
+    side_y: Float[Tensor, " Vy"],
+    parameters: MatchParameters,
+    way: str = "full_map",
+    distance: str = "intrinsic",
+) -> SymmetryTransfer:
+    """Semi-quotient match to the reference, left and right of the source, self-map of the source.
+
+    Args:
+        x: the shape whose symmetry is wanted.
+        y: the reference.
+        group_y: its reflection, ``{id, S}``.
+        side_y: a function of opposite signs left and right on the reference, such as the distance from its plane.
+        parameters: of the matching.
+        way: how left and right are found: ``clustering`` (the paper's, :func:`halves_by_clustering`) or ``full_map``
+            (:func:`halves_by_full_map`, which measures better and also knows direct from mirrored).
+        distance: for ``clustering``: ``intrinsic`` or ``extrinsic``.
+
+    Raises:
+        ValueError: the group is not one reflection, or an unknown ``way``.
+
+    References:
+        Paper, section 6.1.
+    """
+    if group_y.order != 2:
+        raise ValueError(f"group_y has {group_y.order} elements: symmetry transfer needs one reflection, {{id, S}}")
+    semi = match_semi_quotient(x, y, group_y, parameters)
+    halves, odd = None, None
+    warnings: list[str] = []
+    if way == "clustering":
+        phi = displacement(y.mesh, group_y.maps[1], distance, side_y)
+        halves = halves_by_clustering(x, y, group_y, phi, semi, parameters)
+        sign = halves.sign
+        warnings += [halves.warning] if halves.warning else []
+    elif way == "full_map":
+        sign, odd = halves_by_full_map(x, y, side_y, semi, parameters)
+        if not odd.separated:
+            warnings.append(
+                f"left and right could not be told apart clearly (residuals {odd.residual_direct:.2f} for the direct and "
+                f"{odd.residual_mirrored:.2f} for the mirrored map to the reference; 1.5 times is clear)"
+            )
+    else:
+        raise ValueError(f"way={way!r}: allowed are 'clustering' and 'full_map'")
+    fmap = self_map_from_halves(x, sign, parameters)
+    basis = x.basis.truncate(fmap.shape[0])
+    group = SymmetryGroup.from_reflection(fmap_to_p2p(fmap, basis, basis))
+    moved = float(((sign != sign[group.maps[1]]) * x.mesh.vertex_areas).sum())
+    if moved < 0.7:
+        warnings.append(
+            f"the transferred symmetry sends only {moved:.0%} of the area to the other side (nearly all is expected)"
+        )
+    return SymmetryTransfer(group, sign, fmap, semi, halves, odd, warnings)
+
+
+def halves_by_clustering(
+    x: PreparedShape,
+    y: PreparedShape,
+    group_y: SymmetryGroup,
+    phi: Float[Tensor, " Vy"],
+    semi: SemiQuotientMatch,
+    parameters: MatchParameters,
+    k_sharp: int = 100,
+) -> LeftRight:
+    """The paper's way: pull ``phi(y) = d(y, S(y))`` back along the point-to-orbit map and cut the result into two parts.
+
+    Args:
+        x: the shape.
+        y: the reference.
+        group_y: its reflection.
+        phi: ``(Vy,)`` its displacement function.
+        semi: the semi-quotient match.
+        parameters: of the matching.
+        k_sharp: functions in which the point-to-orbit map is refined before it pulls anything back; at
+            ``parameters.k`` it stays as it is, and on animals the clustering then fails
+            (:func:`torchqm.fmap.refine.semi_upsample`).
+
+    References:
+        Paper, section 6.1, steps 1 to 3.
+    """
+    orbit_map = semi.orbit_map
+    if k_sharp > parameters.k:
+        orbit_map = sharpen_orbit_map(semi, x, y, group_y, parameters, k_sharp)
+    return persistence_clusters(x.mesh, pull_back(phi[:, None], orbit_map)[:, 0])
+
+
+def halves_by_full_map(
+    x: PreparedShape,
+    y: PreparedShape,
+    side_y: Float[Tensor, " Vy"],
+    semi: SemiQuotientMatch,
+    parameters: MatchParameters,
+    k_sharp: int = 100,
+) -> tuple[Float[Tensor, " Vx"], OddMap]:
+    """Through the full map to the reference: the kernel of the semi-quotient map is L2- of the source.
+
+    With both halves of the source's basis the odd block can be solved for (:func:`torchqm.matching.odd.solve_odd`); the
+    two blocks make a full map, which is upsampled and tells for each vertex on which side of the reference it lands.
+    No clustering is needed.
+
+    Returns:
+        ``(Vx,)`` signs, and the odd block with its residuals.
+    """
+    odd = solve_odd(x.mesh, y.mesh, semi.source.even, semi.target.even, semi.even, semi.source.odd, semi.target.odd)
+    fmap = join_blocks(semi.source, semi.target, semi.even, odd.fmap)
+    k = min(max(k_sharp, parameters.k), x.basis.k, y.basis.k)
+    samples = x.samples[: parameters.n_samples]
+    if k > parameters.k:
+        sizes = upsampling_sizes(parameters.k, k, parameters.upsample_step)
+        fmap = upsample(fmap, x.basis, y.basis, samples, sizes)
+    p2p = fmap_to_p2p(fmap, x.basis.truncate(fmap.shape[1]), y.basis.truncate(fmap.shape[0]))
+    return torch.sign(side_y[p2p]), odd
+
+
+def self_map_from_halves(
+    x: PreparedShape, sign: Float[Tensor, " V"], parameters: MatchParameters
+) -> Float[Tensor, "K K"]:
+    """Solve ``S f = f`` and ``S (eps f) = -eps f`` for all descriptors f, then refine by ICP.
+
+    Args:
+        x: the shape.
+        sign: its left-right map eps.
+        parameters: ``k``, descriptors, ``icp_steps``; with ``refinement='icp'`` the map ends at k = 100 and 300 like
+            every other, else it grows by ``upsample_step`` with involutions as the space to project to.
+
+    References:
+        Paper, section 6.1, symmetry reconstruction.
+    """
+    basis = x.basis.truncate(parameters.k)
+    (values,) = shared_descriptors([x.basis], parameters)
+    even, odd = basis.coefficients(values), basis.coefficients(sign[:, None] * values)
+    f, g = unit_columns_pair(torch.cat([even, odd], 1), torch.cat([even, -odd], 1))
+    fmap = solve_fmap(f, g, basis.evals, basis.evals, parameters.commutativity * f.shape[1] / basis.k)
+    samples = x.samples[: parameters.n_samples]
+    fmap = quotient_icp(fmap, basis, basis, samples, parameters.icp_steps, parameters.time)
+    if parameters.refinement == "upsample":
+        fmap = nearest_involution(fmap)
+    return refine_self_map(fmap, x.basis, samples, parameters)
+
+
+def nearest_involution(matrix: Float[Tensor, "K K"]) -> Float[Tensor, "K K"]:
+    """The symmetric orthogonal matrix (``C = C^T = C^-1``) nearest to a matrix: eigenvalues of its symmetric part to +-1.
+
+    Example:
+        >>> nearest_involution(torch.tensor([[0.1, 0.9], [0.7, 0.0]])).round().tolist()
+        [[0.0, 1.0], [1.0, 0.0]]
+    """
+    weights, vectors = torch.linalg.eigh((matrix + matrix.T) / 2)
+    return (vectors * torch.where(weights < 0, -1.0, 1.0)) @ vectors.T
+
+
+def refine_self_map(
+    fmap: Float[Tensor, "K K"], basis: SpectralBasis, samples: Tensor, parameters: MatchParameters
+) -> Float[Tensor, "K2 K2"]:
+    """The final refinement of a self-map, by the way ``parameters.refinement`` names."""
+    k_max = min(parameters.k_max, basis.k)
+    if parameters.refinement == "none" or k_max <= fmap.shape[0]:
+        return fmap
+    if parameters.refinement == "icp":
+        fmap = upsample(fmap, basis, basis, samples, [k for k in (100,) if k < k_max], steps=5)
+        return upsample(fmap, basis, basis, samples, [k_max], steps=3)
+    for size in upsampling_sizes(fmap.shape[0], k_max, parameters.upsample_step):
+        # Without the projection the self-map drifts towards the identity, the best map of a shape to itself.
+        fmap = nearest_involution(upsample(fmap, basis, basis, samples, [size]))
+    return fmap

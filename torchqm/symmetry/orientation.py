@@ -1,0 +1,67 @@
+"""Odd functions from pairs of even ones: what tells a direct map from a mirrored one on an oriented surface.
+
+``omega(f, g) = n . (grad f x grad g)`` changes sign under a reflection, so for symmetric f and g it is antisymmetric.
+Intrinsic descriptors say nothing about the odd half of a map; once the even half is known, these functions do.
+"""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchqm.geometry.mesh import Mesh
+
+__all__ = ["function_pairs", "orientation_coefficients", "orientation_form"]
+
+
+def function_pairs(n: int) -> Int[Tensor, "2 P"]:
+    """All pairs ``a < b`` of ``n`` functions, the constant one (index 0) left out: its gradient is zero.
+
+    Example:
+        >>> function_pairs(4).T.tolist()
+        [[1, 2], [1, 3], [2, 3]]
+    """
+    return torch.triu_indices(n - 1, n - 1, 1) + 1
+
+
+def orientation_form(mesh: Mesh, values: Float[Tensor, "V C"], pairs: Int[Tensor, "2 P"]) -> Float[Tensor, "F P"]:
+    """``area * n . (grad f_a x grad f_b)`` on each triangle, for pairs of functions given by their vertex values.
+
+    On a triangle with corners 0, 1, 2 this is ``((f1 - f0)(g2 - g0) - (f2 - f0)(g1 - g0)) / 2``: lengths and angles
+    drop out, only the order of the corners (the orientation of the surface) is used.
+
+    Args:
+        mesh: consistently oriented triangles.
+        values: ``(V, C)`` vertex values of C functions.
+        pairs: ``(2, P)`` which functions to pair.
+
+    Example:
+        >>> triangle = Mesh.from_arrays([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+        >>> orientation_form(triangle, triangle.verts[:, :2], torch.tensor([[0], [1]])).item()
+        0.5
+    """
+    corners = values[mesh.faces]
+    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    a, b = pairs
+    return (u[:, a] * v[:, b] - v[:, a] * u[:, b]) / 2
+
+
+def orientation_coefficients(
+    mesh: Mesh,
+    values: Float[Tensor, "V C"],
+    pairs: Int[Tensor, "2 P"],
+    evecs: Float[Tensor, "V K"],
+) -> Float[Tensor, "K P"]:
+    """``<phi_k, omega(f_a, f_b)>`` for each basis function and pair, integrated exactly over the triangles.
+
+    Args:
+        mesh: consistently oriented.
+        values: functions to pair.
+        pairs: which.
+        evecs: functions to test against: the odd basis.
+    """
+    # Loop over corners instead of gathering (F, 3, K): at 100k faces and 100 functions that would be a third of a GiB.
+    form = orientation_form(mesh, values, pairs)
+    at_vertices = torch.zeros(mesh.n_verts, form.shape[1], dtype=form.dtype)
+    for corner in range(3):
+        at_vertices.index_add_(0, mesh.faces[:, corner], form / 3)
+    return evecs.T @ at_vertices
