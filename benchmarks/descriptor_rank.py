@@ -184,7 +184,7 @@ def main() -> None:
         raise SystemExit("no shapes")
     keys = next(iter(found.values()))
     mean = {key: torch.stack([one[key] for one in found.values()]).mean(0) for key in keys}
-    curves = {key: mean[key] for key in keys if key != "k_even"}
+    curves = {key: mean[key] for key in keys if key != "k_even" and "symmetric part" not in key}
     ranks = {
         key.removeprefix("singular "): {
             f"{share:g}": sum(int((one[key] > share * one[key][0]).sum()) for one in found.values()) / len(found)
@@ -207,7 +207,7 @@ def main() -> None:
     draw(mean, options, f"{len(found)} shapes")
     print(write_json(options.out, result))
     for name, row in ranks.items():
-        print(f"rank, WKS {name:10s}", "  ".join(f"> {share} s1: {rank:.1f}" for share, rank in row.items()))
+        print(f"rank, WKS {name:26s}", "  ".join(f"> {share} s1: {rank:.1f}" for share, rank in row.items()))
     for k in (10, 20, 30, options.k):
         print(
             f"error, k={k}",

@@ -12,6 +12,7 @@ from torchqm.fmap import (
     correspondence_fmap,
     fmap_to_p2p,
     frequency_mask,
+    growing_sizes,
     nearest_isometry,
     p2p_to_fmap,
     quotient_icp,
@@ -83,13 +84,13 @@ def test_frequency_mask():
     assert float(mask[0, 2]) == pytest.approx(torch.exp(torch.tensor(-4.0)).item())
 
 
-@pytest.mark.parametrize("time", [0.0, 0.02])
-def test_one_step_is_the_printed_one(pair, time):
-    samples = pair.samples[:40]
+@pytest.mark.parametrize("options", [{}, {"time": 0.02}, {"width": 0.1}], ids=str)
+def test_one_step_is_the_printed_one(pair, options):
+    samples = pair.samples[:25]
     start = pair.even + 0.1 * noise(*pair.even.shape)
     torch.testing.assert_close(
-        quotient_icp(start, pair.even_x, pair.even_y, samples, steps=1, time=time),
-        dense.icp_step(start, pair.even_x, pair.even_y, samples, time),
+        quotient_icp(start, pair.even_x, pair.even_y, samples, steps=1, **options),
+        dense.icp_step(start, pair.even_x, pair.even_y, samples, **options),
         atol=1e-9,
         rtol=0,
     )
@@ -177,6 +178,18 @@ def test_upsampling_sizes():
     for step, stop in ((0, 10), (5, 0)):
         with pytest.raises(ValueError, match=f"step={step}, stop={stop}"):
             upsampling_sizes(3, stop, step)
+
+
+def test_growing_sizes():
+    assert growing_sizes(30, 60, 1.5) == [45, 60]
+    assert growing_sizes(1, 4, 1.01) == [2, 3, 4]  # by one at least
+    assert growing_sizes(30, 30) == growing_sizes(30, 20) == []
+    sizes = growing_sizes(30, 200)
+    assert sizes[-1] == 200
+    assert all(a < b <= max(a + 1, round(1.2 * a)) for a, b in zip([30, *sizes], sizes, strict=False))
+    for start, ratio in ((30, 1.0), (0, 1.2)):
+        with pytest.raises(ValueError, match=f"ratio={ratio}, start={start}"):
+            growing_sizes(start, 50, ratio)
 
 
 @pytest.mark.parametrize("steps", [1, 3])

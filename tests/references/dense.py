@@ -80,7 +80,14 @@ def nearest_rows(queries: Tensor, points: Tensor) -> Tensor:
     return torch.stack([((points - q) ** 2).sum(1).argmin() for q in queries])
 
 
-def icp_step(fmap_xy: Tensor, basis_x: SpectralBasis, basis_y: SpectralBasis, samples: Tensor, time: float) -> Tensor:
+def icp_step(
+    fmap_xy: Tensor,
+    basis_x: SpectralBasis,
+    basis_y: SpectralBasis,
+    samples: Tensor,
+    time: float = 0.0,
+    width: float | None = None,
+) -> Tensor:
     """One step of quotient-ICP as section 4.3 prints it: a sum of outer products, point by point."""
     decay_x, decay_y = torch.exp(-time * basis_x.evals), torch.exp(-time * basis_y.evals)
     total = torch.zeros_like(fmap_xy)
@@ -88,6 +95,11 @@ def icp_step(fmap_xy: Tensor, basis_x: SpectralBasis, basis_y: SpectralBasis, sa
         source = decay_x * basis_x.evecs[x]
         distance = torch.stack([(decay_y * row - fmap_xy @ source).norm() for row in basis_y.evecs])
         total += torch.outer(decay_y * basis_y.evecs[int(distance.argmin())], source)
+    if width is not None:  # not the paper's: damps entries that join far frequencies
+        scale = max(float(basis_x.evals[-1]), float(basis_y.evals[-1]))
+        for i in range(basis_y.k):
+            for j in range(basis_x.k):
+                total[i, j] *= exp(-((abs(float(basis_x.evals[j] - basis_y.evals[i])) / scale / width) ** 2))
     u, _, v = torch.linalg.svd(total, full_matrices=False)
     return u @ v
 

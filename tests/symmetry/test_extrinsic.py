@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import torch
 from references.shapes import blob, icosphere, rotation
+from scipy.spatial import cKDTree
 
 from torchqm.geometry import Mesh
 from torchqm.symmetry import SymmetryGroup, find_reflection
+from torchqm.symmetry.extrinsic import _reflective_icp
 from torchqm.testing import assert_orbit_equal
 
 
@@ -61,6 +63,14 @@ def test_shape_without_a_plane_is_not_convincing():
     assert not found.convincing
     assert found.residual_max >= found.residual
     assert not find_reflection(blob(1).mesh).convincing  # a gentle asymmetry, no larger than the vertex spacing
+
+
+def test_reflective_icp_moves_the_plane_as_well():
+    points = blob(2).mesh.verts.numpy() + np.array([0.05, 0.3, -0.2])
+    start = np.array([1.0, 0.03, -0.02]) / np.linalg.norm([1.0, 0.03, -0.02])
+    normal, offset = _reflective_icp(cKDTree(points), points, start, 0.0, steps=60)
+    np.testing.assert_allclose(normal, [1, 0, 0], atol=1e-9)
+    assert offset == pytest.approx(0.05, abs=1e-9)
 
 
 def test_vertices_without_faces_are_no_images():

@@ -1,1 +1,1 @@
-"""torchqm.cli"""
+"""The command line, one file a subcommand; nothing heavy is imported before a command runs."""

@@ -7,20 +7,21 @@ from torchqm.fmap.energy import (
     descriptor_energy,
     orthogonality_energy,
 )
-from torchqm.fmap.nearest import nearest_rows
+from torchqm.fmap.nearest import SurfaceSearch, nearest_rows
 from torchqm.fmap.refine import (
     correspondence_fmap,
     frequency_mask,
+    growing_sizes,
     nearest_isometry,
     quotient_icp,
     semi_quotient_icp,
     semi_upsample,
     upsample,
-    upsampling_sizes,
 )
 from torchqm.fmap.solve import solve_fmap
 
 __all__ = [
+    "SurfaceSearch",
     "commutativity_energy",
     "commutativity_weights",
     "correspondence_fmap",
@@ -28,6 +29,7 @@ __all__ = [
     "descriptor_energy",
     "fmap_to_p2p",
     "frequency_mask",
+    "growing_sizes",
     "nearest_isometry",
     "nearest_rows",
     "nearest_used",
@@ -38,5 +40,4 @@ __all__ = [
     "semi_upsample",
     "solve_fmap",
     "upsample",
-    "upsampling_sizes",
 ]

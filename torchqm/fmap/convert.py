@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchqm.fmap.nearest import nearest_rows
+from torchqm.fmap.nearest import SurfaceSearch, nearest_rows
 from torchqm.spectral.basis import SpectralBasis
 
 __all__ = ["deltas", "fmap_to_p2p", "nearest_used", "p2p_to_fmap"]
@@ -29,7 +29,11 @@ def deltas(basis: SpectralBasis, time: float = 0.0) -> Float[Tensor, "V K"]:
 
 
 def fmap_to_p2p(
-    fmap_xy: Float[Tensor, "Ky Kx"], basis_x: SpectralBasis, basis_y: SpectralBasis, time: float = 0.0
+    fmap_xy: Float[Tensor, "Ky Kx"],
+    basis_x: SpectralBasis,
+    basis_y: SpectralBasis,
+    time: float = 0.0,
+    search: SurfaceSearch | None = None,
 ) -> Int[Tensor, " Vx"]:
     """``T(x) = argmin_y || C delta_{x,t} - delta_{y,t} ||``: the vertex whose delta is nearest to the image of a delta.
 
@@ -39,14 +43,23 @@ def fmap_to_p2p(
         basis_y: basis of y with Ky functions. With symmetric functions the result is a *point-to-orbit* map: which
             of the points of an orbit comes back is arbitrary.
         time: diffusion time, as in :func:`deltas`.
+        search: a two-stage search on y, several times faster on large meshes and right nearly always; by default all
+            vertices are compared.
 
     Returns:
         ``p2p_xy`` ``(Vx,)``: for each vertex of x a vertex of y (always one that a face uses).
 
+    Raises:
+        ValueError: the map does not fit the two bases.
+
     References:
         Paper, section 4.4.
     """
+    if fmap_xy.shape != (basis_y.k, basis_x.k):
+        raise ValueError(f"fmap_xy: expected shape ({basis_y.k}, {basis_x.k}), got {tuple(fmap_xy.shape)}")
     images = deltas(basis_x, time) @ fmap_xy.T
+    if search is not None:
+        return search.nearest(images, deltas(basis_y, time))
     return nearest_used(images, basis_y, time)
 
 

@@ -1,16 +1,19 @@
 """Exact nearest neighbours between two sets of spectral coordinates, in bounded memory."""
 
+from dataclasses import dataclass
 from functools import cache
 from types import ModuleType
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 
-__all__ = ["nearest_rows"]
+__all__ = ["SurfaceSearch", "nearest_rows"]
 
 _SMALL = 2_000_000  # distance entries below which one dense product beats building an index
+_FEW = 96  # coordinates up to which blocked products beat faiss (4 times at 20, equal at 100; 2,000 x 5,000)
 
 
 @cache
@@ -23,8 +26,9 @@ def _faiss() -> ModuleType:
 def nearest_rows(queries: Float[Tensor, "Q D"], points: Float[Tensor, "P D"]) -> Int[Tensor, " Q"]:
     """For each query the index of the nearest point: ``argmin_p || q - p ||``.
 
-    Distances are computed in float32 by faiss' flat (exhaustive) index, which never holds the Q x P matrix; small
-    problems are solved in the precision they come in. Where several points are equally near, one of them comes back.
+    Distances are computed in float32, by blocked products where the coordinates are few and by faiss' flat (exhaustive)
+    index where they are many; neither ever holds the Q x P matrix. Small problems are solved in the precision they come
+    in. Where several points are equally near, one of them comes back.
 
     Raises:
         ValueError: the coordinates have different dimensions, there are no points, or some are not finite.
@@ -42,7 +46,87 @@ def nearest_rows(queries: Float[Tensor, "Q D"], points: Float[Tensor, "P D"]) ->
     if queries.shape[0] * points.shape[0] <= _SMALL:
         # || q - p ||^2 without || q ||^2, which is the same for all points
         return torch.argmax(queries @ points.T - points.square().sum(1) / 2, dim=1)
+    if points.shape[1] <= _FEW:
+        return _blocked(_float32(queries), _float32(points))
     index = _faiss().IndexFlatL2(points.shape[1])
-    index.add(np.ascontiguousarray(points.detach().numpy(), dtype=np.float32))
-    _, found = index.search(np.ascontiguousarray(queries.detach().numpy(), dtype=np.float32), 1)
+    index.add(_float32(points))
+    _, found = index.search(_float32(queries), 1)
     return torch.from_numpy(found[:, 0])
+
+
+def _blocked(queries: np.ndarray, points: np.ndarray, rows: int = 64) -> Tensor:
+    """Products of a few rows at a time: a block of distances is still in the cache when its maximum is taken."""
+    half, columns = (points**2).sum(1) / 2, np.ascontiguousarray(points.T)
+    found = [(queries[i : i + rows] @ columns - half).argmax(1) for i in range(0, len(queries), rows)]
+    return torch.from_numpy(np.concatenate(found))
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceSearch:
+    """Nearest vertices of a surface in two stages: among anchor vertices first, then around the best anchors.
+
+    Spectral coordinates are smooth on the surface, so the nearest vertex lies near the nearest anchor. The second stage
+    looks at the vertices closest to that in space, and nowhere else: a search among V vertices costs little more than
+    one among the anchors. It can miss (``benchmarks/speed_pair.py`` prints how often, and by how far).
+
+    Args:
+        anchors: ``(A,)`` vertex ids, spread over the surface.
+        around: ``(A, m)`` for each anchor the vertices closest to it in space, itself first.
+
+    Example:
+        >>> line = torch.arange(10.0, dtype=torch.float64)[:, None]
+        >>> search = SurfaceSearch.build(line, torch.tensor([0, 3, 6, 9]), m=3)
+        >>> search.nearest(line + 0.2, line).tolist()
+        [0, 1, 2, 3, 4, 5, 6, 7, 8, 9]
+    """
+
+    anchors: Int[Tensor, " A"]
+    around: Int[Tensor, "A m"]
+
+    @classmethod
+    def build(cls, verts: Float[Tensor, "V D"], anchors: Int[Tensor, " A"], m: int = 96) -> "SurfaceSearch":
+        """Prepare the search on the vertices of a surface.
+
+        Args:
+            verts: ``(V, 3)`` positions; vertices that no face uses must be left out by the choice of ``anchors`` and
+                lie nowhere near the surface, or be passed as far away.
+            anchors: ids of the first stage.
+            m: vertices looked at around each anchor.
+        """
+        found = cKDTree(verts.numpy()).query(verts[anchors].numpy(), k=min(m, verts.shape[0]))[1]
+        return cls(anchors, torch.from_numpy(found.reshape(len(anchors), -1)))
+
+    def nearest(
+        self, queries: Float[Tensor, "Q K"], points: Float[Tensor, "V K"], n_anchors: int = 1
+    ) -> Int[Tensor, " Q"]:
+        """For each query the nearest of the points around its ``n_anchors`` nearest anchors.
+
+        Args:
+            queries: coordinates looked for.
+            points: coordinates of all V vertices.
+            n_anchors: how many anchors are looked around.
+        """
+        index = _faiss().IndexFlatL2(points.shape[1])
+        queries32, points32 = _float32(queries), _float32(points)
+        index.add(np.ascontiguousarray(points32[self.anchors.numpy()]))
+        _, found = index.search(queries32, n_anchors)
+        around = self.around.numpy()
+        half = (points32**2).sum(1) / 2
+        best = np.full(len(queries32), -np.inf, dtype=np.float32)
+        out = np.zeros(len(queries32), dtype=np.int64)
+        for stage in found.T:
+            order = np.argsort(stage, kind="stable")
+            anchors, starts = np.unique(stage[order], return_index=True)
+            for anchor, mine in zip(anchors, np.split(order, starts[1:]), strict=True):
+                near = around[anchor]
+                value = queries32[mine] @ points32[near].T - half[near]
+                which = value.argmax(1)
+                value = value[np.arange(len(mine)), which]
+                better = value > best[mine]
+                out[mine[better]] = near[which[better]]
+                best[mine[better]] = value[better]
+        return torch.from_numpy(out)
+
+
+def _float32(values: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(values.detach().numpy(), dtype=np.float32)

@@ -20,9 +20,7 @@ from torchqm.spectral.descriptors import (
 __all__ = ["initial_fmap", "shared_descriptors"]
 
 
-def shared_descriptors(
-    bases: Sequence[SpectralBasis], parameters: MatchParameters
-) -> list[Float[Tensor, "V C"]]:
+def shared_descriptors(bases: Sequence[SpectralBasis], parameters: MatchParameters) -> list[Float[Tensor, "_V C"]]:
     """The split descriptors of several shapes, at the same energies and on the same value ranges.
 
     Computed from all the functions that the bases hold (cut at the smaller number), not from the first ``k``: the same
@@ -66,5 +64,3 @@ def unit_columns_pair(
     """:func:`torchqm.spectral.descriptors.unit_columns` for two shapes."""
     first, second = unit_columns([coeffs_x, coeffs_y])
     return first, second
-
-

@@ -62,7 +62,9 @@ def extrinsic_symmetry(shape: PreparedShape, max_residual: float = 0.03) -> Know
         Paper, sections 6.2 and 7.
     """
     found = find_reflection(shape.mesh)
-    numbers = f"rms {found.residual:.4f}, max {found.residual_max:.4f} of sqrt(area); vertex spacing {found.spacing:.4f}"
+    numbers = (
+        f"rms {found.residual:.4f}, max {found.residual_max:.4f} of sqrt(area); vertex spacing {found.spacing:.4f}"
+    )
     details = {
         "residual": found.residual,
         "residual_max": found.residual_max,
@@ -72,7 +74,9 @@ def extrinsic_symmetry(shape: PreparedShape, max_residual: float = 0.03) -> Know
     name = shape.mesh.label
     if found.residual > max_residual:
         text = f"{name}: no mirror plane: the best one leaves a residual above {max_residual:g} ({numbers})"
-        return KnownSymmetry(SymmetryGroup.trivial(shape.n_verts), torch.zeros_like(shape.basis.mass), "none", [text], details)
+        return KnownSymmetry(
+            SymmetryGroup.trivial(shape.n_verts), torch.zeros_like(shape.basis.mass), "none", [text], details
+        )
     warnings = []
     if not found.convincing:
         warnings.append(f"{name}: the mirror plane fits only roughly ({numbers})")
@@ -115,7 +119,10 @@ def given_symmetry(shape: PreparedShape, maps: Int[Tensor, "G V"], origin: str =
 def transferred_symmetry(
     shape: PreparedShape, reference: PreparedShape, known: KnownSymmetry, parameters: MatchParameters, way: str
 ) -> KnownSymmetry:
-    """The symmetry of a shape from a reference whose reflection is known; see :func:`torchqm.matching.transfer.transfer_symmetry`."""
+    """The symmetry of a shape from a reference whose reflection is known.
+
+    Arguments as in :func:`torchqm.matching.transfer.transfer_symmetry`, whose numbers go into ``details``.
+    """
     moved = transfer_symmetry(shape, reference, known.group, known.sign, parameters, way)
     details: dict[str, Any] = {"reference": reference.mesh.label, "way": way}
     if moved.odd is not None:

@@ -22,7 +22,7 @@ class MatchParameters:
         n_samples: vertices, drawn by area, that stand for the surface.
         semi_width: width of the frequency mask in semi-quotient ICP; None is the iteration as printed.
         refinement: ``icp`` (the paper: ICP at k = 100 and 300), ``upsample`` (growing basis) or ``none``.
-        upsample_step: by how many functions the basis grows at a time.
+        growth: ratio by which the basis grows from one step of upsampling to the next.
         seed: of the samples.
     """
 
@@ -34,10 +34,10 @@ class MatchParameters:
     commutativity: float = 100.0
     icp_steps: int = 20
     time: float = 0.0
-    n_samples: int = 4000
+    n_samples: int = 2000
     semi_width: float | None = 0.2
     refinement: str = "upsample"
-    upsample_step: int = 10
+    growth: float = 1.2
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -48,17 +48,20 @@ class MatchParameters:
         for name, allowed in (("descriptor", ("wks", "hks")), ("refinement", ("icp", "upsample", "none"))):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name}={getattr(self, name)!r}: allowed are {', '.join(allowed)}")
-        for name in ("n_descriptors", "n_samples", "upsample_step"):
+        for name in ("n_descriptors", "n_samples"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: must be at least 1")
         for name in ("splits", "icp_steps", "commutativity", "time"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}={getattr(self, name)}: must not be negative")
 
+        if self.growth <= 1:
+            raise ValueError(f"growth={self.growth}: the basis must grow, by a ratio above 1")
+
     @classmethod
     def paper(cls) -> "MatchParameters":
         """Section 7.4: k = 30, WKS with 100 energies, s = 5, 20 ICP steps, then ICP at k = 100 and 300."""
-        return cls(k_max=300, refinement="icp", n_samples=2000)
+        return cls(k_max=300, refinement="icp")
 
     def changed(self, **values: object) -> "MatchParameters":
         """A copy with some values changed, checked again."""

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchqm.fmap.convert import fmap_to_p2p, p2p_to_fmap
+from torchqm.fmap.convert import p2p_to_fmap
 from torchqm.fmap.refine import correspondence_fmap
 from torchqm.geometry.check import check_mesh
 from torchqm.geometry.io import load_mesh
@@ -20,10 +20,17 @@ from torchqm.matching.known import (
 )
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.quality import commutativity_score, orientation_agreement
-from torchqm.matching.quotient import choose_halves, match_quotient, refine_by_icp, refine_by_odd_block, upsample_to
+from torchqm.matching.quotient import (
+    choose_halves,
+    dense_map,
+    match_quotient,
+    refine_by_icp,
+    refine_by_odd_block,
+    upsample_to,
+)
 from torchqm.matching.result import MatchResult, SymmetryResult
 from torchqm.matching.semi_quotient import match_semi_quotient
-from torchqm.matching.shape import PreparedShape, prepare
+from torchqm.matching.shape import N_ANCHORS, PreparedShape, prepare
 from torchqm.matching.steps import StepListener, Steps
 
 __all__ = ["METHODS", "Collection", "find_symmetry", "match", "match_prepared"]
@@ -31,7 +38,7 @@ __all__ = ["METHODS", "Collection", "find_symmetry", "match", "match_prepared"]
 METHODS = ("quotient", "paper", "semi")
 
 # Expected seconds per step and 1000 vertices, for the share of work done; measured once, only their ratios matter.
-_COST = {"eigenpairs": 1.0, "symmetry": 0.5, "quotient": 0.3, "maps": 1.5}
+_COST = {"eigenpairs": 0.55, "plane": 0.5, "transfer": 1.5, "quotient": 0.35, "maps": 0.4}
 
 
 def match(
@@ -47,18 +54,18 @@ def match(
 ) -> MatchResult:
     """All the equally good dense maps from one shape to another.
 
-    The symmetry of at least one shape must be known. With ``symmetry='extrinsic'`` a mirror plane is looked for in the
-    reference if there is one, else in both shapes; a shape without plane gets its symmetry by transfer from one that has
-    it (sections 5 and 6.1). Then the two are matched in the quotient (section 4).
+    The symmetry of at least one shape must be known. With ``symmetry='extrinsic'`` a mirror plane is looked for in
+    the reference if there is one, else in both shapes; a shape without plane gets its symmetry by transfer from one
+    that has it (sections 5 and 6.1). Then the two are matched in the quotient (section 4).
 
     Args:
         source: a mesh or its file.
         target: a mesh or its file.
-        symmetry: ``extrinsic``, ``none``, or the target's symmetry as ``(G, V_target)`` vertex maps, row 0 the identity.
+        symmetry: ``extrinsic``, ``none``, or the target's symmetry as ``(G, V_target)`` vertex maps, identity first.
         symmetry_source: the source's symmetry as vertex maps, if known; else it is found.
         reference: an undeformed pose of the same shape, whose mirror plane gives both shapes their symmetry.
-        method: ``quotient`` (default; what measured best), ``paper`` (sections 4 to 7 as printed) or ``semi`` (section 5
-            alone: the symmetry of the source is used only to choose between the two points of an orbit).
+        method: ``quotient`` (default; what measured best), ``paper`` (sections 4 to 7 as printed) or ``semi`` (section
+            5 alone: the symmetry of the source is used only to choose between the two points of an orbit).
         parameters: numbers of the method; by default those that belong to ``method``.
         listener: told of each step; see :data:`torchqm.matching.steps.StepListener`.
 
@@ -98,6 +105,8 @@ def find_symmetry(
         The group; trivial, with a warning that gives the residual, if no plane was found.
     """
     collection = Collection(reference, method, parameters, listener)
+    mesh = _as_mesh(mesh)
+    collection.steps.total = collection.expected_work(mesh, match=False)
     shape = collection.shape(mesh)
     known = collection.symmetry(shape)
     scores = [commutativity_score(m, shape.basis, shape.basis) for m in known.group.maps]
@@ -151,7 +160,7 @@ class Collection:
         if id(mesh) not in self._shapes:
             with self.steps(f"eigenpairs of {mesh.name}", _COST["eigenpairs"] * mesh.n_verts / 1000):
                 k = self.parameters.k_max
-                prepared = prepare(mesh, k, self.parameters.n_samples, self.parameters.seed)
+                prepared = prepare(mesh, k, max(self.parameters.n_samples, N_ANCHORS), self.parameters.seed)
             self._shapes[id(mesh)] = (mesh, prepared)  # the mesh is kept so that its id stays its own
         return self._shapes[id(mesh)][1]
 
@@ -159,7 +168,7 @@ class Collection:
         """The shape's symmetry: from the reference if there is one, else from its own mirror plane."""
         if id(shape) not in self._symmetries:
             if self._reference is None or self.shape(self._reference) is shape:
-                with self.steps(f"mirror plane of {shape.mesh.name}"):
+                with self.steps(f"mirror plane of {shape.mesh.name}", _COST["plane"] * shape.n_verts / 1000):
                     known = extrinsic_symmetry(shape)
             else:
                 reference = self.shape(self._reference)
@@ -171,7 +180,7 @@ class Collection:
         """A shape's symmetry by transfer from another; trivial if that has none."""
         if not known.known:
             return no_symmetry(shape, list(known.warnings))
-        with self.steps(f"symmetry transfer to {shape.mesh.name}", _COST["symmetry"] * shape.n_verts / 1000):
+        with self.steps(f"symmetry transfer to {shape.mesh.name}", _COST["transfer"] * shape.n_verts / 1000):
             return transferred_symmetry(shape, reference, known, self.parameters, self.way)
 
     def match(
@@ -183,7 +192,9 @@ class Collection:
     ) -> MatchResult:
         """Match two poses; arguments and result as in :func:`match`."""
         meshes = [m if isinstance(m, PreparedShape) else _as_mesh(m) for m in (source, target)]
-        self.steps.total = self.steps.done + self._expected(meshes)
+        self.steps.total = self.steps.done + self.expected_work(
+            *meshes, symmetries=not isinstance(symmetry, str) or symmetry != "none"
+        )
         x, y = (self.shape(m) for m in meshes)
         known_x, known_y = self._both(x, y, symmetry, symmetry_source)
         return match_prepared(x, y, known_x, known_y, self.method, self.parameters, self.steps)
@@ -209,12 +220,25 @@ class Collection:
             known_y = self.transfer(y, x, known_x)
         return known_x, known_y
 
-    def _expected(self, meshes: list[Any]) -> float:
-        """Expected work of a match, in the unit of ``_COST``: eigenpairs of meshes not yet prepared, then the rest."""
-        sizes = [m.n_verts for m in meshes]
-        new = [m for m in [*meshes, self._reference] if isinstance(m, Mesh) and id(m) not in self._shapes]
-        work = _COST["eigenpairs"] * sum(m.n_verts for m in new) + _COST["symmetry"] * sum(sizes)
-        return (work + (_COST["quotient"] + _COST["maps"]) * sizes[0]) / 1000
+    def expected_work(self, *meshes: Mesh | PreparedShape, symmetries: bool = True, match: bool = True) -> float:
+        """Expected work, in the unit of ``_COST``; what was done for an earlier pair costs nothing.
+
+        Args:
+            *meshes: the shapes, source first.
+            symmetries: whether their symmetries are to be found: by transfer to all if there is a reference, else by
+                mirror planes and one transfer.
+            match: whether they are matched after that.
+        """
+        reference = [] if self._reference is None else [self._reference]
+        new = [m for m in [*meshes, *reference] if isinstance(m, Mesh) and id(m) not in self._shapes]
+        work = _COST["eigenpairs"] * sum(m.n_verts for m in new)
+        if symmetries:
+            work += _COST["plane"] * sum(m.n_verts for m in reference or meshes)
+            moved = meshes if reference else meshes[:1] if match else ()
+            work += _COST["transfer"] * sum(m.n_verts for m in moved)
+        if match:
+            work += (_COST["quotient"] + _COST["maps"]) * meshes[0].n_verts
+        return work / 1000
 
 
 def match_prepared(
@@ -232,7 +256,8 @@ def match_prepared(
     warnings = list(dict.fromkeys([*x.warnings, *y.warnings, *known_x.warnings, *known_y.warnings]))
     if known_x.group.order != known_y.group.order:
         warnings.append(
-            f"the groups differ ({known_x.group.order} and {known_y.group.order} elements): matched with the identity alone"
+            f"the groups differ ({known_x.group.order} and {known_y.group.order} elements): "
+            "matched with the identity alone"
         )
         known_x, known_y = no_symmetry(x), no_symmetry(y)
     details: dict[str, Any] = {
@@ -264,9 +289,9 @@ def match_prepared(
                 details |= {"residual_direct": odd.residual_direct, "residual_mirrored": odd.residual_mirrored}
                 separated = odd.separated
             else:
-                halves = choose_halves(found.orbit_map, known_y.group, known_x.sign, known_y.sign)
+                halves = choose_halves(found.orbit_map(x, y), known_y.group, known_x.sign, known_y.sign)
                 fmap = refine_by_icp(halves, x, y, parameters)
-            p2p = fmap_to_p2p(fmap, x.basis.truncate(fmap.shape[1]), y.basis.truncate(fmap.shape[0]))
+            p2p = dense_map(fmap, x, y)
     with steps("scores and labels"):
         if fmap is None:
             k = parameters.k

@@ -1,7 +1,7 @@
 """What a map says about itself, without any ground truth: commutativity and orientation."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from torchqm.fmap.convert import p2p_to_fmap
@@ -14,7 +14,7 @@ __all__ = ["commutativity_score", "orientation_agreement"]
 def commutativity_score(
     p2p_xy: Int[Tensor, " Vx"], basis_x: SpectralBasis, basis_y: SpectralBasis, k: int = 50
 ) -> float:
-    """``|| C Delta - Delta C || / (|| C Delta || + || Delta C ||)`` of the pull-back along a point map; 0 is an isometry.
+    """``|| C Delta - Delta C || / (|| C Delta || + || Delta C ||)`` of the pull-back along a point map; 0: an isometry.
 
     Args:
         p2p_xy: for each vertex of x a vertex of y; its pull-back takes functions on y to functions on x.

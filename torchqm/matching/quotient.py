@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.fmap.convert import fmap_to_p2p
-from torchqm.fmap.refine import correspondence_fmap, quotient_icp, upsample, upsampling_sizes
+from torchqm.fmap.refine import correspondence_fmap, growing_sizes, quotient_icp, upsample
 from torchqm.matching.initial import initial_fmap, shared_descriptors
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
 from torchqm.matching.parameters import MatchParameters
@@ -15,7 +15,7 @@ from torchqm.matching.shape import PreparedShape
 from torchqm.symmetry.basis import SymmetrizedBasis, symmetrized_basis
 from torchqm.symmetry.group import SymmetryGroup
 
-__all__ = ["QuotientMatch", "choose_halves", "match_quotient", "refine_by_icp", "refine_by_odd_block"]
+__all__ = ["QuotientMatch", "choose_halves", "dense_map", "match_quotient", "refine_by_icp", "refine_by_odd_block"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,13 +26,20 @@ class QuotientMatch:
         source: the source's basis, split.
         target: the target's basis, split.
         fmap: ``(K+_y, K+_x)`` the even block C+.
-        orbit_map: ``(V_source,)`` a target vertex whose orbit is the image; which point of the orbit is arbitrary.
+        time: diffusion time of the deltas.
     """
 
     source: SymmetrizedBasis
     target: SymmetrizedBasis
     fmap: Float[Tensor, "Key Kex"]
-    orbit_map: Int[Tensor, " Vx"]
+    time: float = 0.0
+
+    def orbit_map(self, x: PreparedShape, y: PreparedShape) -> Int[Tensor, " Vx"]:
+        """The point-to-orbit map: for each source vertex a target vertex whose *orbit* is the image (section 4.4).
+
+        Which point of the orbit stands here is arbitrary, and neighbours may differ in it.
+        """
+        return fmap_to_p2p(self.fmap, self.source.even, self.target.even, self.time, y.search)
 
 
 def match_quotient(
@@ -54,10 +61,9 @@ def match_quotient(
     target = symmetrized_basis(y.basis.truncate(parameters.k), group_y)
     values_x, values_y = shared_descriptors([x.basis, y.basis], parameters)
     fmap = initial_fmap(source.even, target.even, values_x, values_y, parameters.commutativity)
-    samples = x.samples[: parameters.n_samples]
-    fmap = quotient_icp(fmap, source.even, target.even, samples, parameters.icp_steps, parameters.time)
-    orbit_map = fmap_to_p2p(fmap, source.even, target.even, parameters.time)
-    return QuotientMatch(source, target, fmap, orbit_map)
+    samples, among = x.samples[: parameters.n_samples], target.even.restricted(y.anchors)
+    fmap = quotient_icp(fmap, source.even, among, samples, parameters.icp_steps, parameters.time)
+    return QuotientMatch(source, target, fmap, parameters.time)
 
 
 def choose_halves(
@@ -92,7 +98,7 @@ def choose_halves(
 def refine_by_icp(
     p2p_xy: Int[Tensor, " Vx"], x: PreparedShape, y: PreparedShape, parameters: MatchParameters
 ) -> Float[Tensor, "K K"]:
-    """The paper's last step: the point map as a functional map at k = 100, ICP there (5 steps) and at k = 300 (3 steps).
+    """The paper's last step: the point map as a functional map at k = 100, ICP there (5 steps) and at 300 (3 steps).
 
     Smaller bases are used as far as ``k_max`` allows.
 
@@ -103,8 +109,9 @@ def refine_by_icp(
     k_max = min(parameters.k_max, x.basis.k, y.basis.k)
     k = min(100, k_max)
     fmap = correspondence_fmap(p2p_xy, x.basis.truncate(k), y.basis.truncate(k), samples)
-    fmap = upsample(fmap, x.basis, y.basis, samples, [k], steps=5)
-    return upsample(fmap, x.basis, y.basis, samples, [k_max], steps=3) if k_max > k else fmap
+    among = y.basis.restricted(y.anchors)
+    fmap = upsample(fmap, x.basis, among, samples, [k], steps=5)
+    return upsample(fmap, x.basis, among, samples, [k_max], steps=3) if k_max > k else fmap
 
 
 def refine_by_odd_block(
@@ -116,7 +123,7 @@ def refine_by_odd_block(
         match: the even block at ``parameters.k``.
         x: source, consistently oriented.
         y: target, likewise.
-        parameters: ``k_max``, ``upsample_step``, ``n_samples`` are used.
+        parameters: ``k_max``, ``growth``, ``n_samples`` are used.
 
     Returns:
         The orientation-preserving functional map at ``k_max``, and the odd block with its two residuals.
@@ -135,5 +142,10 @@ def upsample_to(
     k_max = min(parameters.k_max, x.basis.k, y.basis.k)
     if parameters.refinement == "none" or k_max <= fmap.shape[0]:
         return fmap
-    sizes = upsampling_sizes(fmap.shape[0], k_max, parameters.upsample_step)
-    return upsample(fmap, x.basis, y.basis, x.samples[: parameters.n_samples], sizes)
+    sizes = growing_sizes(fmap.shape[0], k_max, parameters.growth)
+    return upsample(fmap, x.basis, y.basis.restricted(y.anchors), x.samples[: parameters.n_samples], sizes)
+
+
+def dense_map(fmap: Float[Tensor, "Ky Kx"], x: PreparedShape, y: PreparedShape) -> Int[Tensor, " Vx"]:
+    """The vertex of y for each vertex of x, from a functional map between the first functions of their full bases."""
+    return fmap_to_p2p(fmap, x.basis.truncate(fmap.shape[1]), y.basis.truncate(fmap.shape[0]), search=y.search)

@@ -133,7 +133,7 @@ def _common(result: MatchResult | SymmetryResult) -> dict[str, Any]:
 
 def write_npz(path: str | Path, **arrays: np.ndarray) -> Path:
     """Write arrays beside the destination and rename: the file is whole or not there at all."""
-    return _replace(Path(path), lambda handle: np.savez_compressed(handle, **arrays))
+    return _replace(Path(path), lambda handle: np.savez_compressed(handle, **arrays))  # type: ignore[arg-type]
 
 
 def write_json(path: str | Path, content: dict[str, Any]) -> Path:

@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.fmap.convert import fmap_to_p2p
-from torchqm.fmap.refine import nearest_isometry, semi_quotient_icp, semi_upsample, upsampling_sizes
+from torchqm.fmap.refine import growing_sizes, nearest_isometry, semi_quotient_icp, semi_upsample
 from torchqm.matching.initial import initial_fmap, shared_descriptors
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.shape import PreparedShape
@@ -57,12 +57,13 @@ def match_semi_quotient(
     values_x, values_y = shared_descriptors([x.basis, y.basis], parameters)
     fmap = initial_fmap(basis_x, target.even, values_x, values_y, parameters.commutativity)
     samples = x.samples[: parameters.n_samples]
+    among = target.even.restricted(y.anchors)
     fmap = semi_quotient_icp(
-        fmap, basis_x, target.even, samples, parameters.icp_steps, parameters.time, parameters.semi_width
+        fmap, basis_x, among, samples, parameters.icp_steps, parameters.time, parameters.semi_width
     )
     fmap = nearest_isometry(fmap)
     source = split_by_projector(basis_x, fmap.T @ fmap)
-    orbit_map = fmap_to_p2p(fmap, basis_x, target.even, parameters.time)
+    orbit_map = fmap_to_p2p(fmap, basis_x, target.even, parameters.time, y.search)
     return SemiQuotientMatch(fmap, target, source, fmap @ source.even_coeffs, orbit_map)
 
 
@@ -81,7 +82,7 @@ def sharpen_orbit_map(
         x: source.
         y: target.
         group_y: symmetry of the target.
-        parameters: ``upsample_step``, ``n_samples`` and ``semi_width`` are used.
+        parameters: ``growth``, ``n_samples`` and ``semi_width`` are used.
         k: functions of the source to reach.
 
     Returns:
@@ -89,11 +90,16 @@ def sharpen_orbit_map(
     """
     k = min(k, x.basis.k)
     even_y = symmetrized_basis(y.basis.truncate(min(k + k // 5, y.basis.k)), group_y).even
-    sizes = upsampling_sizes(semi.fmap.shape[1], k, parameters.upsample_step)
+    sizes = growing_sizes(semi.fmap.shape[1], k, parameters.growth)
     fmap = semi_upsample(
-        semi.fmap, x.basis, even_y, x.samples[: parameters.n_samples], [*sizes, k], parameters.semi_width
+        semi.fmap,
+        x.basis,
+        even_y.restricted(y.anchors),
+        x.samples[: parameters.n_samples],
+        [*sizes, k],
+        parameters.semi_width,
     )
-    return fmap_to_p2p(fmap, x.basis.truncate(fmap.shape[1]), even_y.truncate(fmap.shape[0]))
+    return fmap_to_p2p(fmap, x.basis.truncate(fmap.shape[1]), even_y.truncate(fmap.shape[0]), search=y.search)
 
 
 def pull_back(values: Float[Tensor, "Vy C"], orbit_map: Int[Tensor, " Vx"]) -> Float[Tensor, "Vx C"]:
@@ -103,4 +109,3 @@ def pull_back(values: Float[Tensor, "Vy C"], orbit_map: Int[Tensor, " Vx"]) -> F
     The functions must be symmetric, else the arbitrary choice within an orbit shows.
     """
     return values[orbit_map]
-

@@ -1,11 +1,13 @@
-"""A mesh made ready for matching: unit area, eigenbasis, samples; what is computed once a shape and used by every pair."""
+"""A mesh made ready for matching: unit area, eigenbasis, samples; computed once a shape and used by every pair."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from torchqm.fmap.nearest import SurfaceSearch
 from torchqm.geometry.check import MeshReport, inspect_mesh, orient_faces
 from torchqm.geometry.laplacian import laplacian
 from torchqm.geometry.mesh import Mesh
@@ -13,7 +15,10 @@ from torchqm.geometry.sampling import area_samples
 from torchqm.spectral.basis import SpectralBasis
 from torchqm.spectral.eigen import eigenbasis
 
-__all__ = ["PreparedShape", "prepare"]
+__all__ = ["N_ANCHORS", "PreparedShape", "prepare"]
+
+N_ANCHORS = 5000
+"""Vertices of the target among which refinement steps look for partners, and around which dense searches look."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +28,7 @@ class PreparedShape:
     Args:
         mesh: scaled to total area 1.
         basis: its first eigenpairs, in the same scale.
-        samples: ``(S,)`` vertex ids drawn by area without replacement.
+        samples: ``(S,)`` vertex ids drawn by area without replacement; any first part of them is a sample, too.
         scale: sqrt of the original area: lengths of ``mesh`` times this are lengths of the file.
         operator: ``cotan`` or ``robust``, and why it was chosen.
         oriented: whether ``mesh`` is consistently oriented (normals outward); if not, direct and mirrored are the same.
@@ -43,8 +48,28 @@ class PreparedShape:
         """Number of vertices."""
         return self.mesh.n_verts
 
+    @property
+    def anchors(self) -> Int[Tensor, " A"]:
+        """The first :data:`N_ANCHORS` samples."""
+        return self.samples[:N_ANCHORS]
 
-def prepare(mesh: Mesh, k: int = 200, n_samples: int = 4000, seed: int = 0, kind: str = "auto") -> PreparedShape:
+    @cached_property
+    def search(self) -> SurfaceSearch | None:
+        """Two-stage search for dense maps onto this shape; None where it is small enough to compare all vertices."""
+        if self.n_verts < 2 * N_ANCHORS or len(self.samples) < N_ANCHORS:
+            return None
+        far = torch.where(self.mesh.referenced[:, None], self.mesh.verts, 1e3)  # unit area: out of every neighbourhood
+        return SurfaceSearch.build(far, self.anchors)
+
+
+def prepare(
+    mesh: Mesh,
+    k: int = 200,
+    n_samples: int = N_ANCHORS,
+    seed: int = 0,
+    kind: str = "auto",
+    basis: SpectralBasis | None = None,
+) -> PreparedShape:
     """Scale a mesh to unit area and compute its first ``k`` eigenpairs.
 
     Args:
@@ -53,6 +78,7 @@ def prepare(mesh: Mesh, k: int = 200, n_samples: int = 4000, seed: int = 0, kind
         n_samples: how many vertices stand for the surface in refinement steps.
         seed: of the samples.
         kind: Laplacian, see :func:`torchqm.geometry.laplacian.laplacian`.
+        basis: eigenpairs of ``mesh.normalized()`` from an earlier run, to be used instead of computing them.
 
     Raises:
         SpectrumError: fewer than ``k`` vertices with area.
@@ -60,10 +86,12 @@ def prepare(mesh: Mesh, k: int = 200, n_samples: int = 4000, seed: int = 0, kind
     report = inspect_mesh(mesh)
     operator = laplacian(mesh.normalized(), kind, report)
     unit, oriented, warnings = _outward(mesh, report)
-    basis = eigenbasis(operator, k, mesh.label)
+    basis = eigenbasis(operator, k, mesh.label) if basis is None else basis.truncate(k)
     samples = area_samples(unit, min(n_samples, int((unit.vertex_areas > 0).sum())), seed)
     warnings = [f"{mesh.label}: {text}" for text in [*report.warnings, *warnings]]
-    return PreparedShape(unit, basis, samples, mesh.area**0.5, f"{operator.kind}: {operator.reason}", oriented, warnings)
+    return PreparedShape(
+        unit, basis, samples, mesh.area**0.5, f"{operator.kind}: {operator.reason}", oriented, warnings
+    )
 
 
 def _outward(mesh: Mesh, report: MeshReport) -> tuple[Mesh, bool, list[str]]:

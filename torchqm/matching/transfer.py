@@ -7,14 +7,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchqm.fmap.convert import fmap_to_p2p
-from torchqm.fmap.refine import quotient_icp, upsample, upsampling_sizes
+from torchqm.fmap.refine import growing_sizes, quotient_icp, upsample
 from torchqm.fmap.solve import solve_fmap
 from torchqm.matching.initial import shared_descriptors, unit_columns_pair
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
 from torchqm.matching.parameters import MatchParameters
+from torchqm.matching.quotient import dense_map
 from torchqm.matching.semi_quotient import SemiQuotientMatch, match_semi_quotient, pull_back, sharpen_orbit_map
 from torchqm.matching.shape import PreparedShape
-from torchqm.spectral.basis import SpectralBasis
 from torchqm.symmetry.group import SymmetryGroup
 from torchqm.symmetry.leftright import LeftRight, displacement, persistence_clusters
 
@@ -92,14 +92,14 @@ def transfer_symmetry(
         sign, odd = halves_by_full_map(x, y, side_y, semi, parameters)
         if not odd.separated:
             warnings.append(
-                f"left and right could not be told apart clearly (residuals {odd.residual_direct:.2f} for the direct and "
-                f"{odd.residual_mirrored:.2f} for the mirrored map to the reference; 1.5 times is clear)"
+                f"left and right could not be told apart clearly (residuals {odd.residual_direct:.2f} for the direct "
+                f"and {odd.residual_mirrored:.2f} for the mirrored map to the reference; 1.5 times is clear)"
             )
     else:
         raise ValueError(f"way={way!r}: allowed are 'clustering' and 'full_map'")
     fmap = self_map_from_halves(x, sign, parameters)
     basis = x.basis.truncate(fmap.shape[0])
-    group = SymmetryGroup.from_reflection(fmap_to_p2p(fmap, basis, basis))
+    group = SymmetryGroup.from_reflection(fmap_to_p2p(fmap, basis, basis, search=x.search))
     moved = float(((sign != sign[group.maps[1]]) * x.mesh.vertex_areas).sum())
     if moved < 0.7:
         warnings.append(
@@ -117,7 +117,7 @@ def halves_by_clustering(
     parameters: MatchParameters,
     k_sharp: int = 100,
 ) -> LeftRight:
-    """The paper's way: pull ``phi(y) = d(y, S(y))`` back along the point-to-orbit map and cut the result into two parts.
+    """The paper's way: pull ``phi(y) = d(y, S(y))`` back along the point-to-orbit map and cut the result in two.
 
     Args:
         x: the shape.
@@ -161,9 +161,9 @@ def halves_by_full_map(
     k = min(max(k_sharp, parameters.k), x.basis.k, y.basis.k)
     samples = x.samples[: parameters.n_samples]
     if k > parameters.k:
-        sizes = upsampling_sizes(parameters.k, k, parameters.upsample_step)
-        fmap = upsample(fmap, x.basis, y.basis, samples, sizes)
-    p2p = fmap_to_p2p(fmap, x.basis.truncate(fmap.shape[1]), y.basis.truncate(fmap.shape[0]))
+        sizes = growing_sizes(parameters.k, k, parameters.growth)
+        fmap = upsample(fmap, x.basis, y.basis.restricted(y.anchors), samples, sizes)
+    p2p = dense_map(fmap, x, y)
     return torch.sign(side_y[p2p]), odd
 
 
@@ -176,7 +176,7 @@ def self_map_from_halves(
         x: the shape.
         sign: its left-right map eps.
         parameters: ``k``, descriptors, ``icp_steps``; with ``refinement='icp'`` the map ends at k = 100 and 300 like
-            every other, else it grows by ``upsample_step`` with involutions as the space to project to.
+            every other, else it grows by ``growth`` with involutions as the space to project to.
 
     References:
         Paper, section 6.1, symmetry reconstruction.
@@ -187,17 +187,18 @@ def self_map_from_halves(
     f, g = unit_columns_pair(torch.cat([even, odd], 1), torch.cat([even, -odd], 1))
     fmap = solve_fmap(f, g, basis.evals, basis.evals, parameters.commutativity * f.shape[1] / basis.k)
     samples = x.samples[: parameters.n_samples]
-    fmap = quotient_icp(fmap, basis, basis, samples, parameters.icp_steps, parameters.time)
+    among = basis.restricted(x.anchors)
+    fmap = quotient_icp(fmap, basis, among, samples, parameters.icp_steps, parameters.time)
     if parameters.refinement == "upsample":
         fmap = nearest_involution(fmap)
-    return refine_self_map(fmap, x.basis, samples, parameters)
+    return refine_self_map(fmap, x, parameters)
 
 
 def nearest_involution(matrix: Float[Tensor, "K K"]) -> Float[Tensor, "K K"]:
-    """The symmetric orthogonal matrix (``C = C^T = C^-1``) nearest to a matrix: eigenvalues of its symmetric part to +-1.
+    """The involution ``C = C^T = C^-1`` nearest to a matrix: the eigenvalues of its symmetric part become +-1.
 
     Example:
-        >>> nearest_involution(torch.tensor([[0.1, 0.9], [0.7, 0.0]])).round().tolist()
+        >>> nearest_involution(torch.tensor([[0.1, 0.9], [0.7, 0.0]])).abs().round().tolist()
         [[0.0, 1.0], [1.0, 0.0]]
     """
     weights, vectors = torch.linalg.eigh((matrix + matrix.T) / 2)
@@ -205,16 +206,17 @@ def nearest_involution(matrix: Float[Tensor, "K K"]) -> Float[Tensor, "K K"]:
 
 
 def refine_self_map(
-    fmap: Float[Tensor, "K K"], basis: SpectralBasis, samples: Tensor, parameters: MatchParameters
+    fmap: Float[Tensor, "K K"], x: PreparedShape, parameters: MatchParameters
 ) -> Float[Tensor, "K2 K2"]:
     """The final refinement of a self-map, by the way ``parameters.refinement`` names."""
-    k_max = min(parameters.k_max, basis.k)
+    k_max = min(parameters.k_max, x.basis.k)
     if parameters.refinement == "none" or k_max <= fmap.shape[0]:
         return fmap
+    samples, among = x.samples[: parameters.n_samples], x.basis.restricted(x.anchors)
     if parameters.refinement == "icp":
-        fmap = upsample(fmap, basis, basis, samples, [k for k in (100,) if k < k_max], steps=5)
-        return upsample(fmap, basis, basis, samples, [k_max], steps=3)
-    for size in upsampling_sizes(fmap.shape[0], k_max, parameters.upsample_step):
+        fmap = upsample(fmap, x.basis, among, samples, [k for k in (100,) if k < k_max], steps=5)
+        return upsample(fmap, x.basis, among, samples, [k_max], steps=3)
+    for size in growing_sizes(fmap.shape[0], k_max, parameters.growth):
         # Without the projection the self-map drifts towards the identity, the best map of a shape to itself.
-        fmap = nearest_involution(upsample(fmap, basis, basis, samples, [size]))
+        fmap = nearest_involution(upsample(fmap, x.basis, among, samples, [size]))
     return fmap

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 __all__ = ["SpectralBasis", "cluster_end"]
@@ -59,6 +59,10 @@ class SpectralBasis:
         if not 1 <= k <= self.k:
             raise ValueError(f"k={k}: this basis can be cut at 1..{self.k} functions")
         return self if k == self.k else SpectralBasis(self.evals[:k], self.evecs[:, :k], self.mass)
+
+    def restricted(self, ids: Int[Tensor, " S"]) -> "SpectralBasis":
+        """The same functions at some of the vertices only, for searches among these; no longer orthonormal."""
+        return SpectralBasis(self.evals, self.evecs[ids], self.mass[ids])
 
     def low_pass(self, values: Float[Tensor, "V C"], time: float = 0.0) -> Float[Tensor, "V C"]:
         """Project onto the basis and let heat flow for ``time`` (area): ``Phi exp(-time Lambda) Phi^T A f``."""

@@ -5,6 +5,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 import torch
 from jaxtyping import Float
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from torchqm.geometry.laplacian import Laplacian, laplacian, to_scipy
@@ -95,7 +96,9 @@ def _shift_invert(matrix: sp.csc_array, k: int, name: str) -> tuple[np.ndarray, 
     inverse = spla.LinearOperator((n, n), matvec=factor.solve, dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(n)
     try:
-        return spla.eigsh(matrix, k=k, sigma=SHIFT, which="LM", OPinv=inverse, v0=start, ncv=min(n - 1, 2 * k + 20))
+        # ARPACK calls BLAS on vectors: threads only wait for each other there (4 s became 20 on a busy machine).
+        with threadpool_limits(1, "blas"):
+            return spla.eigsh(matrix, k=k, sigma=SHIFT, which="LM", OPinv=inverse, v0=start, ncv=min(n - 1, 2 * k + 20))
     except spla.ArpackNoConvergence as error:
         raise SpectrumError(
             f"{name}: ARPACK found {len(error.eigenvalues)} of {k} eigenpairs ({error}); "

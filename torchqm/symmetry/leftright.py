@@ -20,7 +20,7 @@ class LeftRight:
     Args:
         sign: ``(V,)`` -1 on one part, +1 on the other, 0 on vertices without area: the left-right map epsilon. Which
             part is called left is arbitrary.
-        persistence: persistences of the finite peaks, largest first (at most ten). The first belongs to the second part.
+        persistence: persistences of the finite peaks, largest first (at most ten); the first is the second part's.
         top: value of the highest peak, whose persistence is infinite.
         balance: area of the smaller part / area of the larger one; 1 for a true reflection.
     """
@@ -32,7 +32,7 @@ class LeftRight:
 
     @property
     def margin(self) -> float:
-        """Second peak's persistence over the third's: how clearly the diagram says "two"; infinite if there are only two."""
+        """Second peak's persistence over the third's: how clearly the diagram says "two"; infinite without a third."""
         if len(self.persistence) < 2:
             return float("inf") if self.persistence else 0.0
         return self.persistence[0] / max(self.persistence[1], 1e-300)

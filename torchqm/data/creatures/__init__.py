@@ -1,0 +1,1 @@
+"""How the built-in creatures are made: skeletons, skin, meshes, poses."""

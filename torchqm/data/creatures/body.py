@@ -9,7 +9,7 @@ from torchqm.data.creatures.remesh import remesh
 from torchqm.data.creatures.skeleton import Skeleton, reflection_group
 from torchqm.data.creatures.surface import field, project, thickness
 
-__all__ = ["Body", "mesh_asymmetrically", "mesh_symmetrically"]
+__all__ = ["Body", "is_sound", "mesh_asymmetrically", "mesh_symmetrically"]
 
 _DIRECT = 6000  # meshes of more vertices (in the fundamental domain) are made by subdivision
 
@@ -67,7 +67,7 @@ def _marching_cubes(skeleton: Skeleton, turn: np.ndarray, shift: np.ndarray, pla
     a, b, c = verts[faces].transpose(1, 0, 2)
     if np.einsum("ni,ni->", np.cross(a, b), c) < 0:
         faces = faces[:, ::-1].copy()
-    return Patch(verts, faces, np.zeros(len(verts), dtype=np.int64))
+    return Patch.bare(verts, faces, np.zeros(len(verts), dtype=np.int64))
 
 
 def _cut(patch: Patch, planes: np.ndarray) -> Patch:
@@ -88,7 +88,7 @@ def _cut(patch: Patch, planes: np.ndarray) -> Patch:
         patch.mask[old:] = on_rim | (1 << bit)
         side = np.concatenate([side, np.zeros(len(patch.verts) - old)])
         keep = (side[patch.faces] >= 0).all(1)
-        patch = Patch(patch.verts, patch.faces[keep], patch.mask).compact()
+        patch = replace(patch, faces=patch.faces[keep]).compact()
     return patch
 
 
@@ -101,7 +101,7 @@ def _largest_component(patch: Patch) -> Patch:
     graph = coo_matrix((np.ones(2 * len(f)), (np.r_[f[:, 0], f[:, 1]], np.r_[f[:, 1], f[:, 2]])), shape=(n, n))
     label = connected_components(graph, directed=False)[1]
     keep = label[f[:, 0]] == np.bincount(label).argmax()
-    return Patch(patch.verts, f[keep], patch.mask).compact()
+    return replace(patch, faces=f[keep]).compact()
 
 
 def _stabilisers(planes: np.ndarray, matrices: np.ndarray) -> np.ndarray:
@@ -146,7 +146,7 @@ def _edge_length(skeleton: Skeleton, patch: Patch, n_verts: float, copies: int) 
     corner = patch.verts[patch.faces]
     areas = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) / 2 * copies
     radius = thickness(skeleton, corner.mean(1))
-    for ratio in (1.2, 1.4, 1.6, 1.8, 2.0):
+    for ratio in (1.1, 1.2, 1.35, 1.5, 1.7, 2.0):
         low, high = 1e-4, 4 * float(radius.max())
         for _ in range(40):
             edge = (low * high) ** 0.5
@@ -175,7 +175,7 @@ def _fit(skeleton: Skeleton, patch: Patch, planes: np.ndarray, n_verts: int) -> 
     scale = 1.0
     patch = remesh(patch, target, onto, rounds=3)
     best, best_error = patch, np.inf
-    for attempt in range(5):
+    for attempt in range(6):
         size = _size(patch, planes)
         error = abs(size / wanted - 1)
         if error < best_error:
@@ -183,7 +183,7 @@ def _fit(skeleton: Skeleton, patch: Patch, planes: np.ndarray, n_verts: int) -> 
         if error < 0.03:
             break
         # Edges between the two thresholds of the remesher stay as they are: push harder each time
-        change = float(np.clip((size / wanted) ** (0.5 + 0.5 * attempt), 0.8, 1.25))
+        change = float(np.clip((size / wanted) ** (0.5 + 0.3 * attempt), 0.8, 1.25))
         edge, scale = edge * change, scale * change
         patch = remesh(replace(patch, verts=patch.verts.copy()), target, onto, rounds=2)
     patch = best
@@ -195,12 +195,13 @@ def _fit(skeleton: Skeleton, patch: Patch, planes: np.ndarray, n_verts: int) -> 
     return patch
 
 
-def _grid_step(skeleton: Skeleton) -> float:
+def _grid_step(skeleton: Skeleton, n_verts: int) -> float:
+    """Fine enough for the thinnest limb; coarser where the mesh is to be coarse anyway."""
     thin = min(float(c.point_radii.min() / np.linalg.svd(c.metric, compute_uv=False).max()) for c in skeleton.chains)
-    return float(np.clip(1.8 * thin, 0.018, 0.032))
+    return float(np.clip(1.8 * thin, np.clip(1.6 / np.sqrt(n_verts), 0.018, 0.034), 0.034))
 
 
-def _is_sound(verts: np.ndarray, faces: np.ndarray) -> bool:
+def is_sound(verts: np.ndarray, faces: np.ndarray) -> bool:
     """Closed, manifold edges, genus 0 and no triangle with an angle below about 3 degrees."""
     edges, _, count = edge_table(faces, len(verts))
     a, b, c = verts[faces].transpose(1, 0, 2)
@@ -225,10 +226,10 @@ def mesh_symmetrically(skeleton: Skeleton, n_verts: int) -> Body:
     planes = skeleton.planes
     for attempt in range(_ATTEMPTS):
         shift = np.array([0.37, 0.41, 0.29]) * (1 - 0.17 * attempt)
-        patch = _marching_cubes(skeleton, np.eye(3), shift, planes, _grid_step(skeleton))
+        patch = _marching_cubes(skeleton, np.eye(3), shift, planes, _grid_step(skeleton, n_verts))
         patch = _largest_component(_cut(patch, planes))
         body = _close(_fit(skeleton, patch, planes, n_verts), planes)
-        if _is_sound(body.verts, body.faces):
+        if is_sound(body.verts, body.faces):
             return body
     raise RuntimeError(f"the {skeleton.kind} could not be meshed with {n_verts} vertices")
 
@@ -252,8 +253,8 @@ def mesh_asymmetrically(skeleton: Skeleton, n_verts: int, seed: int) -> tuple[np
     for _ in range(_ATTEMPTS):
         turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
         turn[:, 0] *= np.sign(np.linalg.det(turn))
-        patch = _marching_cubes(skeleton, turn, rng.random(3), none, 0.95 * _grid_step(skeleton))
+        patch = _marching_cubes(skeleton, turn, rng.random(3), none, 0.95 * _grid_step(skeleton, n_verts))
         patch = _fit(skeleton, _largest_component(patch), none, n_verts)
-        if _is_sound(patch.verts, patch.faces):
+        if is_sound(patch.verts, patch.faces):
             return patch.verts, patch.faces
     raise RuntimeError(f"the {skeleton.kind} could not be meshed with {n_verts} vertices")

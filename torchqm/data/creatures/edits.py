@@ -1,11 +1,13 @@
 """Edits of a surface patch that change its triangles: split, collapse and flip, each as one array operation."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
 
-__all__ = ["Patch", "collapse", "edge_table", "edgeedge_lengths", "face_vectors", "flip", "split"]
+__all__ = ["OPPOSITE", "Patch", "collapse", "edge_lengths", "edge_table", "face_vectors", "flip", "split"]
+
+OPPOSITE = -0.2  # an edge whose normals have a smaller cosine cuts off a limb's end
 
 
 @dataclass
@@ -16,13 +18,20 @@ class Patch:
         verts: ``(V, 3)`` positions.
         faces: ``(F, 3)`` int64.
         mask: ``(V,)`` int64, bit ``i``: the vertex lies on plane ``i`` (0 in the interior).
-        target: ``(V,)`` wanted edge length around each vertex (empty while nothing is wanted).
+        target: ``(V,)`` wanted edge length around each vertex.
+        normal: ``(V, 3)`` unit normals of the smooth surface.
     """
 
     verts: np.ndarray
     faces: np.ndarray
     mask: np.ndarray
-    target: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    target: np.ndarray
+    normal: np.ndarray
+
+    @classmethod
+    def bare(cls, verts: np.ndarray, faces: np.ndarray, mask: np.ndarray) -> "Patch":
+        """A patch for which no edge length is wanted yet."""
+        return cls(verts, faces, mask, np.zeros(len(verts)), np.zeros_like(verts))
 
     def edge_targets(self, edges: np.ndarray) -> np.ndarray:
         """Wanted length of each edge."""
@@ -33,11 +42,11 @@ class Patch:
         used = np.zeros(len(self.verts), dtype=bool)
         used[self.faces] = True
         new_id = np.cumsum(used) - 1
-        return Patch(self.verts[used], new_id[self.faces], self.mask[used], self.target[used[: len(self.target)]])
+        return Patch(self.verts[used], new_id[self.faces], self.mask[used], self.target[used], self.normal[used])
 
 
 def edge_table(faces: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges ``(E, 2)``, the edge of each face side ``(F, 3)`` (side k joins corners k, k + 1) and the faces' count ``(E,)``."""
+    """Edges ``(E, 2)``, the edge of each face's side k from corner k to k + 1 ``(F, 3)``, faces per edge ``(E,)``."""
     a, b = faces, np.roll(faces, -1, axis=1)
     key = np.minimum(a, b) * n + np.maximum(a, b)
     unique, inverse, count = np.unique(key.reshape(-1), return_inverse=True, return_counts=True)
@@ -45,10 +54,12 @@ def edge_table(faces: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def edge_lengths(verts: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Length of each edge."""
     return np.linalg.norm(verts[edges[:, 0]] - verts[edges[:, 1]], axis=1)
 
 
 def face_vectors(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Cross products of two sides of each face, ``(F, 3)``."""
     a, b, c = verts[faces[:, 0]], verts[faces[:, 1]], verts[faces[:, 2]]
     return np.cross(b - a, c - a)
 
@@ -78,8 +89,9 @@ def split(patch: Patch, marked: np.ndarray, edges: np.ndarray, sides: np.ndarray
     out += [np.stack([a, p, c], 1)[~short], np.stack([p, q, c], 1)[~short]]
     (a, b, c), (p, q, r) = f[number == 3].T, m[number == 3].T
     out += [np.stack(t, 1) for t in ((a, p, r), (p, b, q), (r, q, c), (p, q, r))]
-    target = patch.target if len(patch.target) == 0 else np.concatenate([patch.target, patch.edge_targets(ends)])
-    return Patch(verts, np.concatenate(out), np.concatenate([patch.mask, on]), target)
+    target = np.concatenate([patch.target, patch.edge_targets(ends)])
+    normal = np.concatenate([patch.normal, patch.normal[ends].mean(1)])
+    return Patch(verts, np.concatenate(out), np.concatenate([patch.mask, on]), target, normal)
 
 
 def chords(mask: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -126,6 +138,8 @@ def collapse(patch: Patch, cosine: float, salt: int) -> tuple[Patch, int]:
     verts = patch.verts.copy()
     verts[kept] = target
     verts[gone] = target
+    normal = patch.normal.copy()
+    normal[gone] = normal[kept]
     owner = np.full(n, -1)
     owner[kept] = owner[gone] = np.arange(len(ids))
     touch = owner[patch.faces]
@@ -140,6 +154,7 @@ def collapse(patch: Patch, cosine: float, salt: int) -> tuple[Patch, int]:
     bad = ((before * after).sum(1) < cosine * na * nb) & (nb > 1e-3 * size**2)
     bad |= (na < 0.1 * longest**2) & (na < nb)  # a sliver may stay one only if it grows
     bad |= longest > 4 / 3 * size
+    bad |= _opening(normal, patch.faces[rows]) < np.minimum(OPPOSITE, _opening(patch.normal, patch.faces[rows]))
     reject = np.zeros(len(ids), dtype=bool)
     reject[face_owner[rows[bad]]] = True
     reject[(length[ids] < 0.2 * short[ids]) | lean[gone]] = False  # moves next to nothing: only topology counts
@@ -161,6 +176,12 @@ def collapse(patch: Patch, cosine: float, salt: int) -> tuple[Patch, int]:
 def _is_lean(patch: Patch, edges: np.ndarray) -> np.ndarray:
     """Which inner vertices have only three neighbours (one fewer would fold two faces onto each other)."""
     return (np.bincount(edges.reshape(-1), minlength=len(patch.verts)) <= 3) & (patch.mask == 0)
+
+
+def _opening(normal: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Least cosine between the surface normals at two corners of each face."""
+    corner = normal[faces]
+    return (corner * np.roll(corner, 1, axis=1)).sum(2).min(1)
 
 
 def _without_degenerate(faces: np.ndarray) -> np.ndarray:

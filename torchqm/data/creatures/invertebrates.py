@@ -1,6 +1,7 @@
 """The octopus, the ellipsoid-like body and the crab: bodies with many mirror planes and with none."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -52,9 +53,7 @@ def ellipsoid(rng: np.random.Generator) -> Skeleton:
     )
     group = reflection_group(np.eye(3))
 
-    def images(
-        name: str, nodes: list[list[float]], radii: list[float], joints: Sequence[tuple[int, float]]
-    ) -> list[Chain]:
+    def images(name: str, nodes: list[Any], radii: list[Any], joints: Sequence[tuple[int, float]]) -> list[Chain]:
         first = chain(name, nodes, radii, 0.045, "body", joints, orbit=name)
         out_chains: list[Chain] = []
         for m in group:

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from torchqm.data.creatures.skeleton import Chain, Joint
 
@@ -15,12 +15,12 @@ _MIRROR = np.diag([-1.0, 1.0, 1.0])
 
 def chain(
     name: str,
-    nodes: Sequence[ArrayLike],
-    radii: ArrayLike,
+    nodes: Sequence[Any] | np.ndarray,
+    radii: Sequence[Any] | np.ndarray,
     blend: float,
     parent: str | None = None,
     joints: Sequence[tuple[int, float]] = (),
-    metric: ArrayLike = (1.0, 1.0, 1.0),
+    metric: Sequence[Any] = (1.0, 1.0, 1.0),
     orbit: str = "",
 ) -> Chain:
     """A chain; ``joints`` as (node, width), ``metric`` as the diagonal."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchqm.data.creatures.edits import Patch, collapse, edge_lengths, edge_table, face_vectors, flip, split
+from torchqm.data.creatures.edits import OPPOSITE, Patch, collapse, edge_lengths, edge_table, face_vectors, flip, split
 
 __all__ = ["remesh"]
 
@@ -24,7 +24,7 @@ def smooth(patch: Patch, normal: np.ndarray, project: Projector, limit: float, s
     centre = v[F].mean(1) * area[:, None]
     total = np.bincount(F.reshape(-1), np.repeat(area, 3), n)
     goal = np.stack([np.bincount(F.reshape(-1), np.repeat(centre[:, i], 3), n) for i in range(3)], 1)
-    goal = goal / np.maximum(total, 1e-300)[:, None]
+    goal = np.divide(goal, np.maximum(total, 1e-300)[:, None])
     edges, _, count = edge_table(F, n)
     rim = edges[count == 1]
     if len(rim):
@@ -57,7 +57,9 @@ def _split_long(patch: Patch, project: Projector, limit: float) -> tuple[Patch, 
     edges, sides, count = edge_table(patch.faces, len(patch.verts))
     length = edge_lengths(patch.verts, edges)
     chord = (count == 2) & (patch.mask[edges[:, 0]] & patch.mask[edges[:, 1]] > 0)
-    ids = np.flatnonzero((length > 4 / 3 * patch.edge_targets(edges)) | chord)
+    wanted = patch.edge_targets(edges)
+    cosine = (patch.normal[edges[:, 0]] * patch.normal[edges[:, 1]]).sum(1)
+    ids = np.flatnonzero((length > 4 / 3 * wanted) | chord | ((cosine < OPPOSITE) & (length > 0.5 * wanted)))
     ends = patch.verts[edges[ids]]
     on = np.where(count[ids] == 1, np.bitwise_and.reduce(patch.mask[edges[ids]], 1), 0)
     middle, outward = project(ends.mean(1), on, limit, 2)
@@ -74,14 +76,14 @@ def _split_long(patch: Patch, project: Projector, limit: float) -> tuple[Patch, 
     fine = (gap.min(1) > 0.3 * length[ids]) & (gap.max(1) < length[ids])
     fine &= free > 0.25 * length[ids]
     fine &= (around * outward).sum(1) > 0.5 * np.linalg.norm(around, axis=1)
-    middle, ids = middle[fine], ids[fine]
+    middle, outward, ids = middle[fine], outward[fine], ids[fine]
     if len(ids) == 0:
         return patch, 0
     marked = np.zeros(len(edges), dtype=bool)
     marked[ids] = True
     old = len(patch.verts)
     patch = split(patch, marked, edges, sides, count)
-    patch.verts[old:] = middle
+    patch.verts[old:], patch.normal[old:] = middle, outward
     return patch, len(ids)
 
 
@@ -104,7 +106,8 @@ def remesh(
         Botsch, Kobbelt: A Remeshing Approach to Multiresolution Modeling, SGP 2004, section 4.
     """
     for number in range(rounds):
-        patch = replace(patch, target=target(patch.verts))
+        _, normal = project(patch.verts, patch.mask, 0.0, 1)
+        patch = replace(patch, target=target(patch.verts), normal=normal)
         limit = float(patch.target.max())
         for _ in range(8):
             patch, done = _split_long(patch, project, limit)

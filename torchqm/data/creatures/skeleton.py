@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
 __all__ = ["Chain", "Joint", "Skeleton", "reflection_group"]
 
-_SEGMENTS_PER_SPAN = 3
+_SEGMENT = 0.75  # length of the cones in radii
 
 
 @dataclass(frozen=True)
@@ -56,13 +57,14 @@ class Chain:
             points = np.stack([self.nodes[0], self.nodes[0] + 1e-9 * np.array([0.0, 1.0, 0.0])])
             return points, np.repeat(self.radii, 2), np.array([0])
         chord = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(self.nodes, axis=0), axis=1))])
-        steps = 1 if n == 2 else _SEGMENTS_PER_SPAN
-        u = np.concatenate(
-            [np.linspace(chord[i], chord[i + 1], steps, endpoint=False) for i in range(n - 1)] + [chord[-1:]]
-        )
         if n == 2:
             return self.nodes, self.radii, np.array([0, 1])
-        return CubicSpline(chord, self.nodes)(u), PchipInterpolator(chord, self.radii)(u), np.arange(n) * steps
+        radius = (self.radii[1:] + self.radii[:-1]) / 2
+        steps = np.clip(np.ceil(np.diff(chord) / (_SEGMENT * radius)), 2, 8).astype(int)
+        spans = [np.linspace(chord[i], chord[i + 1], steps[i], endpoint=False) for i in range(n - 1)]
+        u = np.concatenate([*spans, chord[-1:]])
+        at_nodes = np.concatenate([[0], np.cumsum(steps)])
+        return CubicSpline(chord, self.nodes)(u), PchipInterpolator(chord, self.radii)(u), at_nodes
 
     @property
     def points(self) -> np.ndarray:
@@ -139,7 +141,7 @@ class Skeleton:
         return [12 * max(blend[i:]) for i in range(len(blend))]
 
 
-def reflection_group(planes: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
+def reflection_group(planes: Sequence[Any] | np.ndarray) -> np.ndarray:
     """All products of the reflections in the given planes, as matrices.
 
     Args:

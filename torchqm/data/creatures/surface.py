@@ -13,7 +13,8 @@ _FAR = 1e3
 def chain_distance(chain: Chain, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Smooth signed distance to one chain, its gradient and the smooth arc length of the nearest point.
 
-    The distances to the chain's round cones are united with a soft minimum ``-k log sum exp(-d / k)``.
+    The distances to the chain's round cones are united with a soft minimum ``-k log sum exp(-d / k)``; the cones are
+    short beside ``sqrt(radius k)``, so that it swells evenly and not just where two of them meet.
 
     Args:
         chain: the chain.
@@ -35,7 +36,7 @@ def chain_distance(chain: Chain, x: np.ndarray) -> tuple[np.ndarray, np.ndarray,
         offset[i] -= t * step[:, i]
     dist = np.sqrt(offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2)
     d = dist - (r0 + t * dr)
-    width = 0.15 * chain.point_radii.min() if len(step) > 1 else 1.0
+    width = 0.15 * float(np.median(chain.point_radii)) if len(step) > 1 else 1.0
     low = d.min(1, keepdims=True)
     weight = np.exp((low - d) / width)
     total = weight.sum(1, keepdims=True)

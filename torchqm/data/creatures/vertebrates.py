@@ -131,6 +131,10 @@ def quadruped(rng: np.random.Generator) -> Skeleton:
         metric=(1.1, 0.97, 1),
     )
     top = np.array(p(0, 0.3 * neck_l, 0.6))
+
+    def head_at(*offset: float) -> np.ndarray:
+        return top + offset
+
     neck = chain(
         "neck",
         [p(0, 0.05, 0.32), p(0, 0.17 * neck_l, 0.47), list(top)],
@@ -139,10 +143,12 @@ def quadruped(rng: np.random.Generator) -> Skeleton:
         "trunk",
         joints=[(1, 0.25)],
     )
-    skull = chain("skull", [top + [0, 0.03, 0.01], top + [0, 0.035, 0.07]], [0.092 * head, 0.095 * head], 0.02, "neck")
+    skull = chain(
+        "skull", [head_at(0, 0.03, 0.01), head_at(0, 0.035, 0.07)], [0.092 * head, 0.095 * head], 0.02, "neck"
+    )
     snout = chain(
         "snout",
-        [top + [0, 0.015, 0.1], top + [0, -0.02, 0.2 * head], top + [0, -0.03, 0.26 * head]],
+        [head_at(0, 0.015, 0.1), head_at(0, -0.02, 0.2 * head), head_at(0, -0.03, 0.26 * head)],
         [0.07 * head, 0.052 * head, 0.046 * head],
         0.02,
         "skull",
@@ -151,9 +157,9 @@ def quadruped(rng: np.random.Generator) -> Skeleton:
     ear = chain(
         "ear_l",
         [
-            top + [0.05 * head, 0.09 * head, 0.0],
-            top + [0.085 * head, 0.165 * head, -0.015],
-            top + [0.1 * head, 0.22 * head, -0.02],
+            head_at(0.05 * head, 0.09 * head, 0.0),
+            head_at(0.085 * head, 0.165 * head, -0.015),
+            head_at(0.1 * head, 0.22 * head, -0.02),
         ],
         [0.04, 0.037, 0.02],
         0.014,

@@ -1,0 +1,92 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+from references import shapes
+
+from torchqm.cli.main import main
+from torchqm.data.synthetic import creature
+from torchqm.geometry import save_mesh
+
+FAST = ["--k-max", "40", "--samples", "300"]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A shape with a mirror plane, a creature at rest and in a pose without plane."""
+    folder = tmp_path_factory.mktemp("files")
+    save_mesh(shapes.blob(2).mesh, folder / "blob.off")
+    save_mesh(creature("quadruped", 600).mesh, folder / "rest.off")
+    save_mesh(creature("quadruped", 600, pose=1).mesh, folder / "posed.off")
+    return folder
+
+
+def test_own_mirror_plane_and_the_file_goes_into_match(files, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["symmetry", str(files / "blob.off"), "--out", str(out), "--no-picture", *FAST]) == 0
+    with np.load(out / "symmetry.npz", allow_pickle=False) as saved:
+        assert set(saved) == {"maps", "labels", "scores"}
+        assert saved["maps"].tolist() == shapes.blob(2).group.maps.tolist()
+        assert saved["labels"].tolist() == ["direct", "mirrored"]
+        assert saved["scores"][0] == pytest.approx(0, abs=1e-9)
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["origin"] == "extrinsic"
+    assert summary["order"] == 2
+    assert "found by: extrinsic" in capsys.readouterr().out
+    blob, given = str(files / "blob.off"), str(out / "symmetry.npz")
+    argv = ["match", blob, blob, "--symmetry", given, "--out", str(tmp_path / "match"), "--no-picture", *FAST]
+    assert main(argv) == 0
+    assert np.load(tmp_path / "match" / "match.npz")["labels"].tolist() == ["direct", "mirrored"]
+
+
+def test_transfer_from_a_reference(files, tmp_path):
+    out = tmp_path / "out"
+    argv = [
+        "symmetry",
+        str(files / "bent.off"),
+        "--reference",
+        str(files / "blob.off"),
+        "--out",
+        str(out),
+        "--no-picture",
+    ]
+    assert main([*argv, "--no-picture", "--k-max", "80"]) == 0
+    assert json.loads((out / "summary.json").read_text())["origin"] == "transfer"
+    rest = creature("quadruped", 600)
+    mesh, truth = rest.mesh, rest.base_group[1]
+    found = torch.from_numpy(np.load(out / "symmetry.npz")["maps"][1])
+    assert float((mesh.verts[found] - mesh.verts[truth]).norm(dim=1).mean()) / mesh.area**0.5 < 0.05
+
+
+def test_no_plane_is_a_warning_with_the_residual(files, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["symmetry", str(files / "posed.off"), "--out", str(out), "--no-picture", *FAST]) == 0
+    assert np.load(out / "symmetry.npz")["maps"].tolist() == [list(range(creature("quadruped", 600).mesh.n_verts))]
+    warnings = json.loads((out / "summary.json").read_text())["warnings"]
+    assert any("no mirror plane" in text and "rms" in text for text in warnings)
+    assert "torchqm: warning:" in capsys.readouterr().err
+
+
+def test_picture(files, tmp_path, monkeypatch):
+    monkeypatch.setattr("torchqm.viz.charts.DPI", 40)
+    monkeypatch.setattr("torchqm.viz.render.REFINE_BELOW", 0)
+    assert main(["symmetry", str(files / "blob.off"), "--out", str(tmp_path / "out"), *FAST]) == 0
+    assert (tmp_path / "out" / "symmetry.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_bad_input(files, tmp_path, capsys):
+    argv = ["symmetry", str(tmp_path / "gone.off"), "--out", str(tmp_path / "out")]
+    assert main(argv) == 2
+    assert "gone.off: no such file" in capsys.readouterr().err
+    argv = [
+        "symmetry",
+        str(files / "rest.off"),
+        "--reference",
+        str(tmp_path / "gone.off"),
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert main(argv) == 2
+    assert "gone.off: no such file" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

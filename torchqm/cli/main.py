@@ -1,0 +1,75 @@
+"""The ``torchqm`` command: its arguments, and what becomes of errors."""
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+
+from torchqm.cli import demo, match, symmetry
+from torchqm.cli.console import UserError
+from torchqm.version import __version__
+
+__all__ = ["build_parser", "main"]
+
+_DESCRIPTION = """\
+Shape matching that knows about symmetry: from two triangle meshes, all the equally
+good dense maps between them (Ovsjanikov et al., "Shape Matching via Quotient Spaces",
+2013)."""
+
+_EPILOG = """\
+first steps:
+  torchqm demo                                  two built-in creatures, checked against the exact truth
+  torchqm match cat3.off cat0.off --out result  all maps from cat3 to cat0
+  torchqm match cat3.off cat5.off --reference cat0.off
+                                                neither pose has a mirror plane, but cat0 has one
+  torchqm symmetry cat3.off --reference cat0.off
+
+'torchqm COMMAND --help' explains a command. Exit status: 0 done, 2 wrong input (one line
+on stderr says which file and what is wrong with it; nothing is written), 130 interrupted."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of all commands; importing and building it takes no torch."""
+    parser = argparse.ArgumentParser(
+        prog="torchqm",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"torchqm {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", dest="command", required=True)
+    for module in (demo, match, symmetry):
+        module.add_parser(commands)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    Args:
+        argv: arguments after the program's name; by default those of the process.
+
+    Returns:
+        0 if it was done, 2 if the input was at fault, 130 if it was interrupted.
+
+    Raises:
+        SystemExit: from argparse, with status 0 for ``--help`` and 2 for arguments it does not know.
+    """
+    arguments = build_parser().parse_args(argv)
+    try:
+        arguments.run(arguments)
+    except UserError as error:
+        print(f"torchqm: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("torchqm: interrupted, nothing was written", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # `torchqm match ... | head`: the reader has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
