@@ -6,16 +6,16 @@ import os
 import platform
 import shlex
 import sys
-import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import torch
 
 from torchqm.geometry import Mesh
+from torchqm.geometry.files import write_whole
 from torchqm.spectral import SpectralBasis, mesh_basis
 from torchqm.version import __version__
 
@@ -48,22 +48,9 @@ def provenance() -> dict[str, Any]:
 def write_json(path: Path, result: Mapping[str, Any]) -> Path:
     """Write :func:`provenance` and a result; numbers of arrays are kept to six digits."""
     text = json.dumps({**provenance(), **_plain(result)}, indent=1, ensure_ascii=False, allow_nan=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, lambda file: file.write((_one_line_lists(text) + "\n").encode()))
     return path
-
-
-def write_whole(path: Path, write: Callable[[BinaryIO], Any]) -> None:
-    """Write beside the destination, then rename: a reader never sees half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            write(file)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
 def cached_basis(mesh: Mesh, k: int, folder: Path | None = None) -> SpectralBasis:
@@ -79,6 +66,7 @@ def cached_basis(mesh: Mesh, k: int, folder: Path | None = None) -> SpectralBasi
             return SpectralBasis(*(torch.from_numpy(kept[name]) for name in ("evals", "evecs", "mass")))
     basis = mesh_basis(mesh, k)
     arrays = {"evals": basis.evals.numpy(), "evecs": basis.evecs.numpy(), "mass": basis.mass.numpy()}
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, lambda file: np.savez(file, **arrays))
     return basis
 

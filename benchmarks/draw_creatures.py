@@ -1,12 +1,12 @@
 """Draw all built-in creatures in two poses each, with the colours carried over by the exact map: docs/creatures.png."""
 
 import argparse
-import os
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
 from torchqm.data.synthetic import CREATURES, creature
+from torchqm.geometry.files import write_whole
 from torchqm.viz.render import View, render_mesh, xyz_colors
 
 VIEWS = {
@@ -29,17 +29,17 @@ def main() -> None:
     options = parser.parse_args()
     rows = len(options.poses or (0, 0))
     figure = Figure(figsize=(2.4 * len(CREATURES), 2.5 * rows), layout="constrained")
+    figure.get_layout_engine().set(rect=(0, 0, 1, 0.94))
     axes = figure.subplots(rows, len(CREATURES), squeeze=False)
     for column, kind in enumerate(CREATURES):
         for row, pose in enumerate(options.poses or POSES[kind]):
             shape = creature(kind, options.n_verts, options.seed, pose)
             # One triangulation: vertex colours of the rest pose are the colours carried over by the exact map
             render_mesh(axes[row, column], shape.mesh, xyz_colors(shape.base), view=VIEWS[kind], up="y")
-        axes[0, column].set_title(f"{kind}: {len(shape.base_group)}", fontsize=10)
+        label = "1 element" if len(shape.base_group) == 1 else f"{len(shape.base_group)} elements"
+        figure.text((column + 0.5) / len(CREATURES), 0.99, f"{kind}, {label}", ha="center", va="top", fontsize=10)
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    part = options.out.with_suffix(".part.png")
-    figure.savefig(part, dpi=90)
-    os.replace(part, options.out)
+    write_whole(options.out, lambda file: figure.savefig(file, format="png", dpi=90))
     print(f"{options.out}: {options.out.stat().st_size / 1000:.0f} kB")
 
 

@@ -29,6 +29,7 @@ from torchqm.evaluate import (
     spread_points,
     summarize,
 )
+from torchqm.fmap import fmap_to_p2p
 from torchqm.geometry import load_mesh
 from torchqm.matching import (
     MatchParameters,
@@ -42,7 +43,6 @@ from torchqm.matching.known import KnownSymmetry
 from torchqm.matching.semi_quotient import sharpen_orbit_map
 from torchqm.matching.transfer import self_map_from_halves, transfer_symmetry
 from torchqm.symmetry import SymmetryGroup, find_reflection
-from torchqm.fmap import fmap_to_p2p
 
 THRESHOLDS = torch.linspace(0, 0.25, 26, dtype=torch.float64)
 N_POINTS = 50  # the paper: 50 uniformly distributed points a class

@@ -42,21 +42,13 @@ def test_own_mirror_plane_and_the_file_goes_into_match(files, tmp_path, capsys):
 
 def test_transfer_from_a_reference(files, tmp_path):
     out = tmp_path / "out"
-    argv = [
-        "symmetry",
-        str(files / "bent.off"),
-        "--reference",
-        str(files / "blob.off"),
-        "--out",
-        str(out),
-        "--no-picture",
-    ]
-    assert main([*argv, "--no-picture", "--k-max", "80"]) == 0
+    argv = ["symmetry", str(files / "posed.off"), "--reference", str(files / "rest.off"), "--out", str(out)]
+    assert main([*argv, "--no-picture"]) == 0
     assert json.loads((out / "summary.json").read_text())["origin"] == "transfer"
     rest = creature("quadruped", 600)
-    mesh, truth = rest.mesh, rest.base_group[1]
+    truth = rest.base_group[1]
     found = torch.from_numpy(np.load(out / "symmetry.npz")["maps"][1])
-    assert float((mesh.verts[found] - mesh.verts[truth]).norm(dim=1).mean()) / mesh.area**0.5 < 0.05
+    assert float((rest.mesh.verts[found] - rest.mesh.verts[truth]).norm(dim=1).mean()) / rest.mesh.area**0.5 < 0.01
 
 
 def test_no_plane_is_a_warning_with_the_residual(files, tmp_path, capsys):

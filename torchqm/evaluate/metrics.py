@@ -10,8 +10,6 @@ References:
 """
 
 import hashlib
-import os
-import tempfile
 import warnings
 import zipfile
 from dataclasses import dataclass
@@ -22,6 +20,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchqm.geometry.files import write_whole
 from torchqm.geometry.mesh import Mesh
 
 __all__ = ["SurfacePoints", "TruthDistances", "geodesic_errors", "group_truth", "spread_points"]
@@ -296,11 +295,4 @@ def _read_rows(path: Path, sources: Int[Tensor, " U"], n_verts: int) -> Float[Te
 
 def _write_rows(path: Path, sources: Int[Tensor, " U"], rows: Float[Tensor, "U V"]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, beside = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, rows=rows.numpy(), sources=sources.numpy())
-        os.replace(beside, path)
-    except BaseException:
-        Path(beside).unlink(missing_ok=True)
-        raise
+    write_whole(path, lambda file: np.savez(file, rows=rows.numpy(), sources=sources.numpy()))

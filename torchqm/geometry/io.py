@@ -1,12 +1,12 @@
 """Reading and writing meshes: OFF, OBJ, PLY, STL and the two forms of TOSCA; vertex ids stay as in the file."""
 
 import difflib
-import os
 from pathlib import Path
 
 import numpy as np
 
 from torchqm.geometry.check import MeshError, check_arrays, weld
+from torchqm.geometry.files import write_whole
 from torchqm.geometry.formats import READERS
 from torchqm.geometry.mesh import Mesh
 
@@ -75,14 +75,10 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
             f"{path}: cannot write {path.suffix or 'a file without ending'}; supported are {', '.join(WRITABLE)}"
         )
     content = {".off": _off_bytes, ".obj": _obj_bytes, ".ply": _ply_bytes}[path.suffix.lower()](*mesh.numpy())
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        beside.write_bytes(content)
-        os.replace(beside, path)
+        write_whole(path, lambda file: file.write(content))
     except OSError as error:
         raise MeshError(f"{path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def _check_file(path: Path) -> None:

@@ -12,7 +12,7 @@ from torchqm.matching.shape import PreparedShape
 from torchqm.matching.transfer import transfer_symmetry
 from torchqm.symmetry.extrinsic import find_reflection
 from torchqm.symmetry.group import SymmetryGroup
-from torchqm.symmetry.leftright import displacement, persistence_clusters
+from torchqm.symmetry.leftright import displacement, halves_of_reflection, persistence_clusters
 
 __all__ = ["KnownSymmetry", "extrinsic_symmetry", "given_symmetry", "no_symmetry", "transferred_symmetry"]
 
@@ -80,7 +80,8 @@ def extrinsic_symmetry(shape: PreparedShape, max_residual: float = 0.03) -> Know
     warnings = []
     if not found.convincing:
         warnings.append(f"{name}: the mirror plane fits only roughly ({numbers})")
-    sign = torch.sign(found.side(shape.mesh.verts))
+    # Not the sign of the side alone: on the axis that is rounding, and would differ with the units of the file.
+    sign = halves_of_reflection(shape.mesh, found.map, found.side(shape.mesh.verts))
     return KnownSymmetry(SymmetryGroup.from_reflection(found.map), sign, "extrinsic", warnings, details)
 
 

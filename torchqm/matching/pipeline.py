@@ -149,7 +149,7 @@ class Collection:
         self.steps = Steps(listener=listener)
         self.way = "full_map" if method == "quotient" else "clustering"
         self._shapes: dict[int, tuple[Mesh, PreparedShape]] = {}
-        self._symmetries: dict[int, KnownSymmetry] = {}
+        self._symmetries: dict[int, tuple[PreparedShape, KnownSymmetry]] = {}
         self._reference = None if reference is None else _as_mesh(reference)
 
     def shape(self, mesh: Mesh | str | Path | PreparedShape) -> PreparedShape:
@@ -173,8 +173,8 @@ class Collection:
             else:
                 reference = self.shape(self._reference)
                 known = self.transfer(shape, reference, self.symmetry(reference))
-            self._symmetries[id(shape)] = known
-        return self._symmetries[id(shape)]
+            self._symmetries[id(shape)] = (shape, known)  # kept like the meshes above
+        return self._symmetries[id(shape)][1]
 
     def transfer(self, shape: PreparedShape, reference: PreparedShape, known: KnownSymmetry) -> KnownSymmetry:
         """A shape's symmetry by transfer from another; trivial if that has none."""

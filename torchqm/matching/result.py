@@ -1,9 +1,7 @@
 """What a match gives back: all the equally good maps, their labels and scores, and everything needed to judge them."""
 
 import json
-import os
 import platform
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchqm.geometry.files import write_whole
 from torchqm.version import __version__
 
 __all__ = ["MatchResult", "SymmetryResult", "write_json", "write_npz"]
@@ -132,24 +131,11 @@ def _common(result: MatchResult | SymmetryResult) -> dict[str, Any]:
 
 
 def write_npz(path: str | Path, **arrays: np.ndarray) -> Path:
-    """Write arrays beside the destination and rename: the file is whole or not there at all."""
-    return _replace(Path(path), lambda handle: np.savez_compressed(handle, **arrays))  # type: ignore[arg-type]
+    """Write arrays to one compressed ``.npz``, whole or not at all."""
+    return write_whole(path, lambda file: np.savez_compressed(file, **arrays))  # type: ignore[arg-type]
 
 
 def write_json(path: str | Path, content: dict[str, Any]) -> Path:
     """Write a dictionary as indented JSON, whole or not at all."""
     text = json.dumps(content, indent=2, ensure_ascii=False, default=str) + "\n"
-    return _replace(Path(path), lambda handle: handle.write(text.encode()))
-
-
-def _replace(path: Path, write: Any) -> Path:
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            write(stream)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-    return path
+    return write_whole(path, lambda file: file.write(text.encode()))

@@ -88,7 +88,7 @@ def prepare(
     unit, oriented, warnings = _outward(mesh, report)
     basis = eigenbasis(operator, k, mesh.label) if basis is None else basis.truncate(k)
     samples = area_samples(unit, min(n_samples, int((unit.vertex_areas > 0).sum())), seed)
-    warnings = [f"{mesh.label}: {text}" for text in [*report.warnings, *warnings]]
+    warnings = [*report.warnings, *(f"{mesh.label}: {text}" for text in warnings)]
     return PreparedShape(
         unit, basis, samples, mesh.area**0.5, f"{operator.kind}: {operator.reason}", oriented, warnings
     )

@@ -1,7 +1,5 @@
 """Charts (error curves, lines, bars), and the making and atomic saving of every figure; pyplot is never touched."""
 
-import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +11,8 @@ from torch import Tensor
 if TYPE_CHECKING:
     import matplotlib.axes
     import matplotlib.figure
+
+from torchqm.geometry.files import write_whole
 
 __all__ = ["bar_figure", "cumulative_curve", "error_curves", "line_figure", "new_figure", "save_figure"]
 
@@ -63,17 +63,8 @@ def save_figure(figure: "matplotlib.figure.Figure", path: str | Path) -> Path:
     if kind not in allowed:
         raise ValueError(f"path: given {str(path)!r}; allowed are names that end in {', '.join(allowed)}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".{kind}.tmp", dir=path.parent)
     try:
-        with os.fdopen(handle, "wb") as file:
-            figure.savefig(file, format=kind, dpi=DPI)
-        mask = os.umask(0o022)
-        os.umask(mask)
-        os.chmod(name, 0o666 & ~mask)  # mkstemp makes private files; a picture is not
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+        write_whole(path, lambda file: figure.savefig(file, format=kind, dpi=DPI))
     finally:
         figure.clear()
     return path

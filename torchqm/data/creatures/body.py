@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from torchqm.data.creatures.edits import Patch, edge_table, split
-from torchqm.data.creatures.remesh import remesh
+from torchqm.data.creatures.edits import Patch, edge_table, flip, split
+from torchqm.data.creatures.remesh import remesh, smooth
 from torchqm.data.creatures.skeleton import Skeleton, reflection_group
 from torchqm.data.creatures.surface import field, project, thickness
 
@@ -190,7 +190,10 @@ def _fit(skeleton: Skeleton, patch: Patch, planes: np.ndarray, n_verts: int) -> 
     for _ in range(levels):
         edges, sides, count = edge_table(patch.faces, len(patch.verts))
         patch = split(patch, np.ones(len(edges), dtype=bool), edges, sides, count)
-        patch.verts, _ = onto(patch.verts, patch.mask, edge, 2)
+        patch.verts, normal = onto(patch.verts, patch.mask, edge, 2)
+        for _ in range(2):
+            patch, _ = flip(patch)
+            normal = smooth(patch, normal, onto, edge)
     patch.verts, _ = onto(patch.verts, patch.mask, edge, 3)
     return patch
 

@@ -45,7 +45,7 @@ def _biped(u: _Dice) -> dict[str, np.ndarray]:
         swing = sign * stride * 1.1
         out[f"arm_{side}"] = _mirrored(
             [
-                (swing - u(-10, 45)) * _X + u(-12, 48) * _Z + u(-20, 5) * _Y,
+                (swing - u(-10, 45)) * _X + u(-12, 40) * _Z + u(-20, 5) * _Y,
                 -u(8, 65) * _Y - u(0, 30) * _X,
                 u(-12, 12) * _Z,
             ],

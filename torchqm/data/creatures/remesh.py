@@ -7,7 +7,7 @@ import numpy as np
 
 from torchqm.data.creatures.edits import OPPOSITE, Patch, collapse, edge_lengths, edge_table, face_vectors, flip, split
 
-__all__ = ["remesh"]
+__all__ = ["remesh", "smooth"]
 
 Projector = Callable[[np.ndarray, np.ndarray, float, int], tuple[np.ndarray, np.ndarray]]
 

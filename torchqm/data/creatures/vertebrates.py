@@ -111,7 +111,7 @@ def biped(rng: np.random.Generator) -> Skeleton:
         metric=(0.85, 1, 1),
     )
     pairs = paired([ear, leg_chain, foot, arm_chain, palm, thumb])
-    return Skeleton("biped", (trunk, neck, skull, jaw, nose, *pairs), np.array([[1.0, 0, 0]]), 0.05)
+    return Skeleton("biped", (trunk, neck, skull, jaw, nose, *pairs), np.array([[1.0, 0, 0]]), 0.04)
 
 
 def quadruped(rng: np.random.Generator) -> Skeleton:
