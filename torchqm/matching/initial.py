@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -34,6 +35,8 @@ def shared_descriptors(bases: Sequence[SpectralBasis], parameters: MatchParamete
     else:
         times = heat_times(bases, parameters.n_descriptors)
         values = [heat_kernel_signature(b, times) for b in bases]
+    # Eigenfunctions are 0 at vertices without area; that is no value of the shape, and must not widen the ranges.
+    values = [torch.where((b.mass > 0)[:, None], v, v[b.mass > 0].amin(0)) for b, v in zip(bases, values, strict=True)]
     return split_descriptors(values, parameters.splits)
 
 

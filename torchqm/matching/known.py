@@ -40,6 +40,11 @@ class KnownSymmetry:
         """Whether there is more than the identity."""
         return self.group.order > 1
 
+    @property
+    def firm(self) -> bool:
+        """Whether it is known without a doubt: a better source for a transfer than a doubtful symmetry of one's own."""
+        return self.known and not self.warnings
+
 
 def no_symmetry(shape: PreparedShape, warnings: list[str] | None = None) -> KnownSymmetry:
     """The trivial group: the shape goes through the same code and gives one map."""
@@ -47,7 +52,7 @@ def no_symmetry(shape: PreparedShape, warnings: list[str] | None = None) -> Know
     return KnownSymmetry(group, torch.zeros(shape.n_verts, dtype=torch.float64), "none", warnings or [])
 
 
-def extrinsic_symmetry(shape: PreparedShape, max_residual: float = 0.03) -> KnownSymmetry:
+def extrinsic_symmetry(shape: PreparedShape, max_residual: float = 0.02) -> KnownSymmetry:
     """The reflection in the best mirror plane, if the shape is its own mirror image up to ``max_residual``.
 
     Args:

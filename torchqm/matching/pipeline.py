@@ -214,9 +214,10 @@ class Collection:
             raise ValueError(f"symmetry={symmetry!r}: allowed are 'extrinsic', 'none' or a table of vertex maps")
         if known_x is None and (isinstance(symmetry, str) or self.method != "semi"):
             known_x = self.symmetry(x)
-        if known_x is None or (known_y.known and not known_x.known):
+        # A doubtful plane of one's own (a pose that is nearly symmetric) gives way to a transfer from a firm one.
+        if known_x is None or (known_y.known and not known_x.known) or (known_y.firm and not known_x.firm):
             known_x = self.transfer(x, y, known_y)
-        elif known_x.known and not known_y.known:
+        elif (known_x.known and not known_y.known) or (known_x.firm and not known_y.firm):
             known_y = self.transfer(y, x, known_x)
         return known_x, known_y
 

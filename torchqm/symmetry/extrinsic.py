@@ -51,7 +51,7 @@ class ExtrinsicReflection:
         return self.residual**2 <= 0.01**2 + (self.spacing / 2) ** 2
 
 
-def find_reflection(mesh: Mesh, n_samples: int = 1000, n_refine: int = 4, seed: int = 0) -> ExtrinsicReflection:
+def find_reflection(mesh: Mesh, n_samples: int = 500, n_refine: int = 3, seed: int = 0) -> ExtrinsicReflection:
     """Find the plane in which the shape is most nearly its own mirror image.
 
     Candidates are the three principal planes and a spread of directions over the half sphere, all through the
@@ -80,21 +80,21 @@ def find_reflection(mesh: Mesh, n_samples: int = 1000, n_refine: int = 4, seed: 
     verts = verts - centre
     used = np.flatnonzero(weights > 0)
     tree = cKDTree(verts[used])
-    coarse = verts[area_samples(mesh, min(n_samples, used.size), seed).numpy()]
-    fine = verts[area_samples(mesh, min(8 * n_samples, used.size), seed + 1).numpy()]
+    few, many = (verts[area_samples(mesh, min(n, used.size), seed).numpy()] for n in (n_samples, 4 * n_samples))
+    coarse = cKDTree(many)
 
     _, axes = np.linalg.eigh((verts * weights[:, None]).T @ verts)
     starts: list[Plane] = [(axis, 0.0) for axis in np.concatenate([axes.T, _half_sphere(45)])]
-    candidates = [_reflective_icp(tree, coarse, normal, offset, steps=8) for normal, offset in starts]
-    order = np.argsort([_rms(tree, coarse, normal, offset) for normal, offset in candidates], kind="stable")
+    candidates = [_reflective_icp(coarse, few, normal, offset, steps=8) for normal, offset in starts]
+    order = np.argsort([_rms(coarse, few, normal, offset) for normal, offset in candidates], kind="stable")
     best = [candidates[i] for i in order[:n_refine].tolist()]
-    refined = [_reflective_icp(tree, fine, normal, offset, steps=60) for normal, offset in best]
-    normal, offset = min(refined, key=lambda c: _rms(tree, fine, c[0], c[1]))
+    refined = [_reflective_icp(tree, many, normal, offset, steps=30) for normal, offset in best]
+    normal, offset = min(refined, key=lambda c: _rms(tree, many, c[0], c[1]))
     if normal[np.argmax(np.abs(normal))] < 0:
         normal, offset = -normal, -offset
 
     distance, partner = _nearest(tree, _mirror(verts, normal, offset))
-    spacing = np.asarray(tree.query(fine, k=2)[0])[:, 1]
+    spacing = np.asarray(tree.query(many, k=2)[0])[:, 1]
     return ExtrinsicReflection(
         normal=torch.from_numpy(normal.copy()),
         offset=float((offset + normal @ centre) * scale),
