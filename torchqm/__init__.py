@@ -6,7 +6,7 @@ else is in the subpackages ``geometry, spectral, symmetry, fmap, matching, data,
 
 Example:
     >>> import torchqm
-    >>> mesh = torchqm.creature("quadruped", 600).mesh
+    >>> mesh = torchqm.creature("quadruped", 1000).mesh
     >>> symmetry = torchqm.find_symmetry(mesh, parameters=torchqm.MatchParameters(k_max=30))
     >>> symmetry.labels
     ('direct', 'mirrored')

@@ -8,6 +8,7 @@ from torchqm.cli import main as module
 from torchqm.cli.console import UserError
 from torchqm.cli.inputs import _OPTIONS
 from torchqm.cli.main import build_parser, main
+from torchqm.cli.threads import set_threads
 from torchqm.matching import METHODS, MatchParameters
 from torchqm.version import __version__
 
@@ -37,6 +38,7 @@ def test_help_exits_with_0_and_fits_a_terminal(command, capsys):
         ["match", "a.off"],
         ["match", "a.off", "b.off", "--k", "many"],
         ["match", "a.off", "b.off", "--time", "nan"],
+        ["match", "a.off", "b.off", "--threads", "0"],
         ["match", "a.off", "b.off", "--method", "best"],
         ["demo", "--creature", "unicorn"],
     ],
@@ -70,7 +72,7 @@ def run_as(monkeypatch, error):
 
     class Parser:
         def parse_args(self, argv):
-            return type("Arguments", (), {"run": staticmethod(fail)})()
+            return type("Arguments", (), {"run": staticmethod(fail), "threads": None, "default_threads": None})()
 
     monkeypatch.setattr(module, "build_parser", lambda: Parser())
 
@@ -105,3 +107,23 @@ def test_help_and_import_load_nothing_heavy(words):
     code += "print(sorted({n.split('.')[0] for n in sys.modules} & {'torch', 'numpy', 'scipy', 'matplotlib', 'gudhi'}))"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize(
+    ("given", "default", "before", "after"),
+    [(None, None, None, None), (None, 1, None, "1"), (None, 1, "4", "4"), (3, 1, "4", "3"), (3, None, None, "3")],
+)
+def test_threads_are_what_was_given_else_the_environment_else_the_default(monkeypatch, given, default, before, after):
+    monkeypatch.delitem(sys.modules, "numpy")  # as in a fresh process
+    environment = {} if before is None else {"OMP_NUM_THREADS": before}
+    monkeypatch.setattr("torchqm.cli.threads.os.environ", environment)
+    set_threads(given, default)
+    assert environment.get("OMP_NUM_THREADS") == after
+    assert environment["OMP_WAIT_POLICY"] == "PASSIVE"
+
+
+def test_threads_of_a_running_process_are_left_alone(monkeypatch):
+    environment = {}
+    monkeypatch.setattr("torchqm.cli.threads.os.environ", environment)
+    set_threads(3, 1)
+    assert environment == {}

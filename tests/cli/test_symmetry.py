@@ -17,8 +17,8 @@ def files(tmp_path_factory):
     """A shape with a mirror plane, a creature at rest and in a pose without plane."""
     folder = tmp_path_factory.mktemp("files")
     save_mesh(shapes.blob(2).mesh, folder / "blob.off")
-    save_mesh(creature("quadruped", 600).mesh, folder / "rest.off")
-    save_mesh(creature("quadruped", 600, pose=1).mesh, folder / "posed.off")
+    save_mesh(creature("quadruped", 1000).mesh, folder / "rest.off")
+    save_mesh(creature("quadruped", 1000, pose=1).mesh, folder / "posed.off")
     return folder
 
 
@@ -45,7 +45,7 @@ def test_transfer_from_a_reference(files, tmp_path):
     argv = ["symmetry", str(files / "posed.off"), "--reference", str(files / "rest.off"), "--out", str(out)]
     assert main([*argv, "--no-picture"]) == 0
     assert json.loads((out / "summary.json").read_text())["origin"] == "transfer"
-    rest = creature("quadruped", 600)
+    rest = creature("quadruped", 1000)
     truth = rest.base_group[1]
     found = torch.from_numpy(np.load(out / "symmetry.npz")["maps"][1])
     assert float((rest.mesh.verts[found] - rest.mesh.verts[truth]).norm(dim=1).mean()) / rest.mesh.area**0.5 < 0.01
@@ -54,7 +54,7 @@ def test_transfer_from_a_reference(files, tmp_path):
 def test_no_plane_is_a_warning_with_the_residual(files, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["symmetry", str(files / "posed.off"), "--out", str(out), "--no-picture", *FAST]) == 0
-    assert np.load(out / "symmetry.npz")["maps"].tolist() == [list(range(creature("quadruped", 600).mesh.n_verts))]
+    assert np.load(out / "symmetry.npz")["maps"].tolist() == [list(range(creature("quadruped", 1000).mesh.n_verts))]
     warnings = json.loads((out / "summary.json").read_text())["warnings"]
     assert any("no mirror plane" in text and "rms" in text for text in warnings)
     assert "torchqm: warning:" in capsys.readouterr().err

@@ -94,6 +94,7 @@ class Progress:
     def _draw(self) -> None:
         with self._lock:
             running = f" {self._step} ({self.clock() - self._step_began:.0f} s)" if self._step else ""
+            running = " reading" if self._began is None else running
             self._write(f"\r\033[K[{self._percent()}]{running}{self._left()}")
 
     def _tick(self) -> None:

@@ -8,6 +8,7 @@ from torchqm.cli.console import Progress, UserError, format_table, print_seconds
 from torchqm.cli.folder import staged_folder
 from torchqm.cli.inputs import METHODS, as_plain
 from torchqm.cli.match import FILES, write_match
+from torchqm.cli.threads import add_threads
 
 if TYPE_CHECKING:
     from torchqm.data.synthetic import Creature
@@ -50,17 +51,18 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--method", choices=METHODS, default="quotient", help="as in 'torchqm match' (default: quotient)"
     )
+    add_threads(parser, 1)  # at this size a second thread gains little
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Match two creatures, measure the maps, write the results."""
     with staged_folder(arguments.out, FILES) as stage, Progress() as progress:
-        with progress.step("building the creatures", 0.2):
+        with progress.step("building the creatures", 0.35):
             source, target = _creatures(arguments.creature, arguments.n_verts, arguments.seed)
         from torchqm.matching import match
 
-        with progress.stage(0.5):
+        with progress.stage(0.35):
             result = match(source.mesh, target.mesh, method=arguments.method, listener=progress.listener)
         with progress.step("errors against the truth", 0.2):
             errors = _measure(result, source, target)

@@ -173,4 +173,5 @@ def read_symmetry(path: Path, mesh: "Mesh") -> tuple["Tensor", list[str]]:
 
 def as_plain(arguments: argparse.Namespace) -> dict[str, Any]:
     """The arguments as they were given, for ``summary.json``."""
-    return {name: str(v) if isinstance(v, Path) else v for name, v in vars(arguments).items() if name != "run"}
+    hidden = ("run", "default_threads")
+    return {name: str(v) if isinstance(v, Path) else v for name, v in vars(arguments).items() if name not in hidden}

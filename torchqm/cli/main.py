@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from torchqm.cli import demo, match, symmetry
 from torchqm.cli.console import UserError
+from torchqm.cli.threads import set_threads
 from torchqm.version import __version__
 
 __all__ = ["build_parser", "main"]
@@ -57,6 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         SystemExit: from argparse, with status 0 for ``--help`` and 2 for arguments it does not know.
     """
     arguments = build_parser().parse_args(argv)
+    set_threads(arguments.threads, arguments.default_threads)
     try:
         arguments.run(arguments)
     except UserError as error:

@@ -17,6 +17,7 @@ from torchqm.cli.inputs import (
     read_symmetry,
     shape_faults,
 )
+from torchqm.cli.threads import add_threads
 
 if TYPE_CHECKING:
     from torchqm.geometry import Mesh
@@ -79,6 +80,7 @@ def add_parser(commands: Any) -> None:
         help="quotient (default): what measured best; paper: sections 4 to 7 as printed; semi: section 5 alone",
     )
     parser.add_argument("--no-picture", action="store_true", help="do not draw match.png")
+    add_threads(parser)
     add_parameters(parser)
     parser.set_defaults(run=run)
 
@@ -97,6 +99,8 @@ def run(arguments: argparse.Namespace) -> None:
         parameters, notes = fit_parameters(parameters, seen.values(), arguments.k_max is not None)
         symmetry: Any = arguments.symmetry
         if symmetry not in ("extrinsic", "none"):
+            if not Path(symmetry).exists():
+                raise UserError(f"{symmetry}: no such file; --symmetry is extrinsic, none or a file")
             symmetry, more = read_symmetry(Path(symmetry), target)
             notes += more
         symmetry_source = None

@@ -15,6 +15,7 @@ from torchqm.cli.inputs import (
     read_mesh,
     shape_faults,
 )
+from torchqm.cli.threads import add_threads
 
 if TYPE_CHECKING:
     from torchqm.geometry import Mesh
@@ -61,6 +62,7 @@ def add_parser(commands: Any) -> None:
         help="way of transfer. quotient (default): what measured best; paper: section 6.1 as printed",
     )
     parser.add_argument("--no-picture", action="store_true", help="do not draw symmetry.png")
+    add_threads(parser)
     add_parameters(parser)
     parser.set_defaults(run=run)
 

@@ -124,7 +124,7 @@ def creature(kind: str, n_verts: int = 5000, seed: int = 0, pose: int = 0, retri
     Args:
         kind: one of :data:`CREATURES`; their groups have 2 (biped, quadruped), 16 (octopus), 8 (ellipsoid) and
             1 (asymmetric) elements.
-        n_verts: wanted number of vertices, 500 to 400000; the mesh has this many within 5 percent (mostly 3).
+        n_verts: wanted number of vertices, 500 to 400000; reached within 5 percent (10 below 1000).
         seed: draws the proportions of the body; the same seed gives the same mesh bit for bit.
         pose: 0 for the rest pose, else a seed for the joint angles.
         retriangulate: 0 for the triangulation that all poses share, else a seed for another one.
@@ -136,7 +136,7 @@ def creature(kind: str, n_verts: int = 5000, seed: int = 0, pose: int = 0, retri
         ValueError: on an unknown kind, a size out of range or a negative seed.
 
     Example:
-        >>> c = creature("ellipsoid", n_verts=1000)
+        >>> c = creature("ellipsoid", n_verts=500)
         >>> len(c.base_group), c.retriangulated
         (8, False)
     """
@@ -204,7 +204,7 @@ def exact_maps(source: Creature, target: Creature) -> ExactMaps:
         ValueError: if the two are not the same body.
 
     Example:
-        >>> a = creature("quadruped", 1000)
+        >>> a = creature("ellipsoid", 500)
         >>> bool((exact_maps(a, a).nearest_vertices() == a.base_group).all())
         True
     """

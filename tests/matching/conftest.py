@@ -1,0 +1,16 @@
+"""Shapes that the matching tests share; each is prepared once."""
+
+import pytest
+from references import pairs
+
+
+@pytest.fixture(scope="session")
+def exact():
+    """A blob with one exact reflection and its renumbered copy."""
+    return pairs.exact_pair()
+
+
+@pytest.fixture(scope="session", params=[False, True], ids=["same", "mirrored"])
+def either(request):
+    """The exact pair, and the same with a mirrored target: the known vertex map is then the mirrored one."""
+    return pairs.exact_pair(2, request.param)

@@ -1,0 +1,110 @@
+import pytest
+import torch
+from references.pairs import FAST, exact_pair, side_of
+from references.unchecked import unchecked
+
+from torchqm.data.synthetic import creature
+from torchqm.matching import extrinsic_symmetry, given_symmetry, no_symmetry, prepare, transferred_symmetry
+
+
+@pytest.fixture(scope="module")
+def known(exact):
+    return extrinsic_symmetry(exact.x)
+
+
+@pytest.fixture(scope="module")
+def lopsided():
+    """A creature without symmetry."""
+    return prepare(creature("asymmetric", 600).mesh, 10)
+
+
+def test_no_symmetry(exact):
+    known = no_symmetry(exact.x, ["why"])
+    assert torch.equal(known.group.maps, torch.arange(642)[None])
+    assert torch.equal(known.sign, torch.zeros(642, dtype=torch.float64))
+    assert (known.known, known.origin, known.warnings) == (False, "none", ["why"])
+
+
+def test_mirror_plane(exact, known):
+    assert torch.equal(known.group.maps, exact.group_x.maps)
+    assert (known.known, known.origin, known.warnings) == (True, "extrinsic", [])
+    assert known.details["residual"] < 1e-6
+    assert abs(known.details["normal"][0]) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_left_right_and_exactly_nothing_on_the_axis(exact, known, scale):
+    """The side of a vertex on the axis is rounding; its sign would change with the units of the file."""
+    mesh = exact.x.mesh
+    found = extrinsic_symmetry(prepare(mesh.moved(mesh.verts * scale + 0.1 * scale), 5))
+    side = side_of(exact.x, exact.group_x)
+    assert 20 < int((side == 0).sum()) < 60
+    assert torch.equal(found.sign, side) or torch.equal(found.sign, -side)
+    assert torch.equal(found.sign, known.sign)
+
+
+def test_a_lopsided_shape_has_the_trivial_group(lopsided):
+    known = extrinsic_symmetry(lopsided)
+    assert known.group.order == 1
+    assert (known.known, known.origin) == (False, "none")
+    assert torch.equal(known.sign, torch.zeros(lopsided.n_verts, dtype=torch.float64))
+    (text,) = known.warnings
+    assert text.startswith(f"{lopsided.mesh.label}: no mirror plane")
+    assert f"rms {known.details['residual']:.4f}" in text
+    assert known.details["residual"] > 0.03
+
+
+def test_a_rough_plane_is_used_and_told(lopsided):
+    known = extrinsic_symmetry(lopsided, max_residual=1.0)
+    assert known.group.order == 2
+    assert "fits only roughly" in known.warnings[0]
+    assert f"rms {known.details['residual']:.4f}" in known.warnings[0]
+
+
+class TestGiven:
+    def test_halves_are_found(self, exact):
+        known = given_symmetry(exact.x, exact.group_x.maps)
+        assert torch.equal(known.group.maps, exact.group_x.maps)
+        assert (known.known, known.origin, known.warnings) == (True, "file", [])
+        assert known.details["involution_error"] == 0
+        side = exact.side_x
+        assert float((known.sign * side)[side != 0].mean().abs()) > 0.97
+
+    def test_the_identity_alone(self, exact):
+        known = given_symmetry(exact.x, torch.arange(642)[None], "none")
+        assert (known.known, known.origin) == (False, "none")
+        assert torch.equal(known.sign, torch.zeros(642, dtype=torch.float64))
+
+    def test_nearly_an_involution(self, exact):
+        """Vertex maps of real symmetries do not come back exactly."""
+        maps = exact.group_x.maps.clone()
+        neighbour = exact.x.mesh.edges[:, 1][torch.searchsorted(exact.x.mesh.edges[:, 0].contiguous(), 7)]
+        maps[1, 7] = maps[1, neighbour]
+        known = given_symmetry(exact.x, maps)
+        assert 0 < known.details["involution_error"] < 0.001
+
+    @pytest.mark.parametrize(
+        ("spoil", "message"),
+        [
+            (lambda maps: maps[:, :600], "600 entries a row, but blob2 has 642 vertices"),
+            (lambda maps: maps.flip(0), "row 0 must be the identity"),
+            (lambda maps: maps + torch.tensor([[0], [1]]), r"ids must lie in 0\.\.641"),
+            (lambda maps: torch.stack([maps[0], maps[0].roll(160)]), "row 1 of the symmetry is no reflection: .* 0.1 is"),
+            (lambda maps: exact_pair(4).group_x.maps, "blob2: the symmetry has 4 elements"),
+        ],
+        ids=["length", "identity", "ids", "involution", "order"],
+    )
+    def test_refusals(self, exact, spoil, message):
+        with pytest.raises(ValueError, match=message):
+            unchecked(given_symmetry)(exact.x, spoil(exact.group_x.maps))
+
+
+@pytest.mark.parametrize("way", ["full_map", "clustering"])
+def test_transferred(exact, known, way):
+    found = transferred_symmetry(exact.y, exact.x, known, FAST, way)
+    assert float((found.group.maps[1] == exact.group_y.maps[1]).double().mean()) > 0.99
+    assert (found.known, found.origin, found.warnings) == (True, "transfer", [])
+    assert found.details["reference"] == "blob2"
+    assert found.details["way"] == way
+    numbers = {"full_map": {"residual_direct", "residual_mirrored"}, "clustering": {"persistence", "margin", "balance"}}
+    assert set(found.details) == {"reference", "way"} | numbers[way]
