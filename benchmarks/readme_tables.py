@@ -19,6 +19,22 @@ from torchqm.geometry.files import write_whole
 BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
 
 
+def joined(files: list[dict[str, Any]]) -> dict[str, Any]:
+    """Result files of different classes as one: means over all poses or pairs, each counting once."""
+    out = {**files[0], "classes": {c: v for data in files for c, v in data["classes"].items()}}
+    out["command"] = "` and `".join(data["command"] for data in files)
+    out["all"] = {}
+    for figure, rows in files[0]["all"].items():
+        out["all"][figure] = {}
+        for key in rows:
+            cells = [data["all"][figure][key] for data in files]
+            n = sum(cell["n_pairs"] for cell in cells)
+            mean = sum(cell["n_pairs"] * cell["mean"] for cell in cells) / n
+            below = sum(cell["n_pairs"] * cell["share_below"]["0.05"] for cell in cells) / n
+            out["all"][figure][key] = {"n_pairs": n, "mean": mean, "share_below": {"0.05": below}}
+    return out
+
+
 def tosca(data: dict[str, Any]) -> str:
     """Figures 6, 8 and 10, one row a class."""
     lines = [
@@ -95,7 +111,10 @@ def main() -> int:
     parser.add_argument("--check", action="store_true")
     args = parser.parse_args()
     parts = []
-    for name, make in (("tosca", tosca), ("creatures", creatures), ("speed_pair", speed)):
+    found = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("tosca*.json"))]
+    if found:
+        parts.append(tosca(joined(found)))
+    for name, make in (("creatures", creatures), ("speed_pair", speed)):
         path = RESULTS / f"{name}.json"
         if path.is_file():
             parts.append(make(json.loads(path.read_text())))

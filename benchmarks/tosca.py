@@ -1,15 +1,19 @@
 """The paper's Figures 6, 8 and 10 on TOSCA: semi-quotient matching, symmetry, quotient matching beside BIM.
 
-    python benchmarks/tosca.py --scb ROOT [--cache DIR] [--classes cat,centaur,david,wolf]
+    python benchmarks/tosca.py --scb ROOT [--cache DIR] [--classes cat,centaur,david,wolf] [--out FILE]
+    python benchmarks/tosca.py --draw
 
 ROOT holds TOSCA/Meshes, TOSCA/Corrs and Results/Results_Corr_TOSCA (the SCB benchmark of Kim et al. 2011). Writes
-benchmarks/results/tosca.json and docs/tosca_figure{6,8,10}.png. Errors are geodesic / sqrt(area of the target).
+benchmarks/results/tosca.json (--out: classes run at the same time may write files of their own beside it); --draw makes
+docs/tosca_figure{6,8,10}.png from all of them. Errors are geodesic / sqrt(area of the target).
 """
 
 import argparse
+import json
 from pathlib import Path
 from time import perf_counter
 
+import numpy as np
 import torch
 from common import DOCS, RESULTS, cached_basis, write_json
 from torch import Tensor
@@ -44,6 +48,7 @@ from torchqm.matching.semi_quotient import sharpen_orbit_map
 from torchqm.matching.transfer import self_map_from_halves, transfer_symmetry
 from torchqm.symmetry import SymmetryGroup, find_reflection
 
+SEMI = "semi-quotient, k=30"
 THRESHOLDS = torch.linspace(0, 0.25, 26, dtype=torch.float64)
 N_POINTS = 50  # the paper: 50 uniformly distributed points a class
 PAPER, OURS = MatchParameters.paper(), MatchParameters()
@@ -104,7 +109,7 @@ def figure6(shapes: Shapes, name: str) -> dict[str, ErrorReport]:
     semi = match_semi_quotient(x, y, group, PAPER)
     printed = match_semi_quotient(x, y, group, PAPER.changed(semi_width=None))
     maps = {
-        "semi-quotient, k=30": semi.orbit_map,
+        SEMI: semi.orbit_map,
         "semi-quotient, k=30, ICP as printed": printed.orbit_map,
         "semi-quotient, upsampled to k=100": sharpen_orbit_map(semi, x, y, group, PAPER),
     }
@@ -116,8 +121,9 @@ def symmetries(shapes: Shapes, name: str) -> dict[str, tuple[SymmetryGroup, Symm
     """A shape's symmetry by the three ways that Figure 8 compares."""
     x, y = shapes.shape(name), shapes.shape(shapes.truth.undeformed)
     truth = shapes.truth
-    by_paper = transfer_symmetry(x, y, truth.group, truth.side, PAPER, "clustering")
-    ours = transfer_symmetry(x, y, truth.group, truth.side, OURS, "full_map")
+    semi = match_semi_quotient(x, y, truth.group, PAPER)  # the two sets of parameters do not differ in what it uses
+    by_paper = transfer_symmetry(x, y, truth.group, truth.side, PAPER, "clustering", semi=semi)
+    ours = transfer_symmetry(x, y, truth.group, truth.side, OURS, "full_map", semi=semi)
     exact = self_map_from_halves(x, torch.sign(truth.side), PAPER)
     basis = x.basis.truncate(exact.shape[0])
     return {
@@ -198,22 +204,37 @@ def table(reports: list[dict[str, ErrorReport]]) -> dict[str, dict]:
     return {key: summarize([r[key] for r in reports]).to_dict() for key in (reports[0] if reports else {})}
 
 
-def draw(rows: dict[str, list[ErrorReport]], path: Path, title: str) -> None:
-    from torchqm.viz import error_curves
+def draw() -> None:
+    """Figures 6, 8 and 10 from the curves in all the result files: the mean over shapes, or pairs, of all classes."""
+    from torchqm.viz import line_figure
 
-    error_curves(
-        {name: torch.cat([r.errors for r in reports]).numpy() for name, reports in rows.items()}, path, title=title
-    )
+    files = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("tosca*.json"))]
+    for number in (6, 8, 10):
+        figure = f"figure{number}"
+        count = [data["all"][figure]["paper, exact axis" if number > 6 else SEMI]["n_pairs"] for data in files]
+        series = {}
+        for key in [k for k in files[0]["curves"][figure] if "landmarks" not in k]:
+            curves = [n * np.array(data["curves"][figure][key]) for n, data in zip(count, files, strict=True)]
+            series[key] = (np.array(files[0]["curves"]["thresholds"]), sum(curves) / sum(count))
+        title = f"TOSCA, Figure {number}: {sum(count)} {'pairs' if number == 10 else 'shapes'}"
+        path = DOCS / f"tosca_figure{number}.png"
+        line_figure(series, path, "geodesic error / sqrt(area)", "share of correspondences", title=title)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scb", type=Path, required=True, help="folder of the SCB benchmark")
+    parser.add_argument("--scb", type=Path, help="folder of the SCB benchmark")
     parser.add_argument("--cache", type=Path, help="folder for eigenbases and distances")
     parser.add_argument("--classes", default="wolf,centaur,cat,david")
     parser.add_argument("--out", type=Path, default=RESULTS / "tosca.json")
+    parser.add_argument("--draw", action="store_true", help="draw the figures from the result files and stop")
     parser.add_argument("--prepare-only", action="store_true", help="fill the cache and stop")
     args = parser.parse_args()
+    if args.draw:
+        draw()
+        return
+    if args.scb is None:
+        parser.error("--scb ROOT is needed")
     benchmark = SCBenchmark(args.scb)
     result: dict[str, dict] = {
         "points_per_shape": N_POINTS,
@@ -272,11 +293,6 @@ def main() -> None:
         write_json(args.out, result)
     if args.prepare_only:
         return
-    for number, reports in ((6, all6), (8, all8), (10, all10)):
-        keys = [k for k in reports[0] if "landmarks" not in k]
-        rows = {k: [r[k] for r in reports] for k in keys}
-        n = len(reports)
-        draw(rows, DOCS / f"tosca_figure{number}.png", f"Figure {number}: {n} {'pairs' if number == 10 else 'shapes'}")
     result["curves"] = {"thresholds": THRESHOLDS} | {
         f"figure{number}": {
             k: mean_curve([cumulative_curve(r[k].errors, THRESHOLDS) for r in reports]) for k in reports[0]

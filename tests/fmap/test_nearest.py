@@ -1,22 +1,26 @@
-"""torchqm.fmap.nearest: both ways of searching against all distances."""
+"""torchqm.fmap.nearest: all ways of searching against all distances."""
 
 import pytest
 import torch
 from references import dense
+from references.pairs import K, exact_pair
 from references.unchecked import unchecked
 
 import torchqm.fmap.nearest as module
-from torchqm.fmap import nearest_rows
+from torchqm.fmap import SurfaceSearch, nearest_rows
+from torchqm.geometry import area_samples
 
 
 def noise(*shape, seed=0):
     return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-@pytest.fixture(params=["product", "faiss"])
+@pytest.fixture(params=["product", "blocks", "faiss"])
 def search(request, monkeypatch):
-    if request.param == "faiss":
+    if request.param != "product":
         monkeypatch.setattr(module, "_SMALL", 0)
+    if request.param == "faiss":
+        monkeypatch.setattr(module, "_FEW", 0)
     return nearest_rows
 
 
@@ -35,12 +39,31 @@ def test_points_find_themselves(search):
     assert torch.equal(search(points, points), torch.arange(100))
 
 
-def test_both_ways_take_any_layout_and_single_precision(search):
+def test_all_ways_take_any_layout_and_single_precision(search):
     queries, points = noise(5, 40).T, noise(5, 60, seed=1).T  # not contiguous
     wanted = dense.nearest_rows(queries, points)
     assert torch.equal(search(queries, points), wanted)
     assert torch.equal(search(queries.float(), points.float()), wanted)
     assert torch.equal(search(queries.clone().requires_grad_(), points), wanted)
+
+
+def test_each_way_is_taken(search, request, monkeypatch):
+    """Else the other tests would compare one and the same way with itself."""
+    taken = []
+    faiss, blocked = module._faiss, module._blocked
+    monkeypatch.setattr(module, "_faiss", lambda: taken.append("faiss") or faiss())
+    monkeypatch.setattr(module, "_blocked", lambda *a: taken.append("blocks") or blocked(*a))
+    search(noise(20, 4), noise(30, 4))
+    wanted = request.node.callspec.params["search"]
+    assert taken == ([] if wanted == "product" else [wanted])
+
+
+@pytest.mark.parametrize("q", [1, 63, 64, 65, 200])
+def test_blocks_of_any_size_are_put_together(q):
+    queries, points = noise(q, 6), noise(300, 6, seed=1)
+    for rows in (1, 7, 64):
+        found = module._blocked(queries.float().numpy(), points.float().numpy(), rows)
+        assert torch.equal(found, dense.nearest_rows(queries, points))
 
 
 def test_refusals(search):
@@ -56,3 +79,74 @@ def test_refusals(search):
             search(spoilt, noise(4, 3))
         with pytest.raises(ValueError, match="must be finite"):
             search(noise(4, 3), spoilt)
+
+
+class TestSurfaceSearch:
+    """On a real embedding: the exact pair's eigenfunctions, queries somewhat off the surface."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def problem(cls):
+        shape = exact_pair().x
+        points = shape.basis.evecs
+        queries = points + 0.1 * noise(642, K)
+        return shape, queries, points, nearest_rows(queries, points)
+
+    def build(self, shape, n_anchors=100, m=96):
+        return SurfaceSearch.build(shape.mesh.verts, area_samples(shape.mesh, n_anchors), m)
+
+    @pytest.mark.parametrize("n_anchors", [1, 3, 100])
+    @pytest.mark.parametrize("m", [642, 10_000])
+    def test_exact_where_all_vertices_are_looked_at(self, problem, n_anchors, m):
+        shape, queries, points, wanted = problem
+        search = self.build(shape, n_anchors, m)
+        assert search.around.shape == (n_anchors, 642)
+        found = search.nearest(queries, points)
+        assert found.dtype == torch.int64
+        assert torch.equal(found, wanted)
+
+    def test_nearly_always_right_on_a_smooth_embedding(self, problem):
+        shape, queries, points, wanted = problem
+        search = self.build(shape, 200, 30)  # a twentieth of the vertices, which lie in space where queries do not
+        found = search.nearest(queries, points)
+        assert float((found == wanted).double().mean()) > 0.99
+        assert float((search.nearest(points, points) == torch.arange(642)).double().mean()) > 0.99
+
+    def test_the_best_of_what_is_around_the_nearest_anchors(self, problem):
+        """Query by query; few vertices around few anchors, so that it misses, and misses the same way."""
+        shape, queries, points, wanted = problem
+        search = self.build(shape, 60, 8)
+        for n in (1, 3):
+            distance = torch.cdist(queries, points[search.anchors])
+            near = search.around[distance.topk(n, largest=False).indices].flatten(1)
+            best = torch.cdist(queries[:, None], points[near])[:, 0].argmin(1)
+            found = search.nearest(queries, points, n)
+            assert torch.equal(found, near[torch.arange(642), best])
+            assert not torch.equal(found, wanted)
+
+    def test_more_anchors_never_look_worse(self, problem):
+        shape, queries, points, wanted = problem
+        search = self.build(shape, 60, 12)
+        right = [float((search.nearest(queries, points, n) == wanted).double().mean()) for n in (1, 2, 5, 60)]
+        assert right == sorted(right)
+        assert right[0] < right[-1]
+
+    def test_around_each_anchor(self, problem):
+        shape, *_ = problem
+        search = self.build(shape, 20, 9)
+        assert torch.equal(search.around[:, 0], search.anchors)
+        distance = torch.cdist(shape.mesh.verts[search.anchors], shape.mesh.verts)
+        wanted = distance.topk(9, largest=False).values
+        torch.testing.assert_close(distance.gather(1, search.around), wanted, atol=1e-7, rtol=0)
+
+    def test_layout_and_precision(self, problem):
+        shape, queries, points, _ = problem
+        search = self.build(shape)
+        wanted = search.nearest(queries, points)
+        assert torch.equal(search.nearest(queries.T.contiguous().T, points.float().requires_grad_()), wanted)
+
+    def test_one_vertex_around_each(self, problem):
+        shape, queries, points, _ = problem
+        search = self.build(shape, 30, 1)
+        found = search.nearest(queries, points)
+        assert torch.equal(found, search.anchors[nearest_rows(queries, points[search.anchors])])

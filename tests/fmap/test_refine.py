@@ -19,9 +19,9 @@ from torchqm.fmap import (
     semi_quotient_icp,
     semi_upsample,
     upsample,
-    upsampling_sizes,
 )
 from torchqm.geometry import area_samples
+from torchqm.spectral import SpectralBasis
 from torchqm.symmetry import symmetrized_basis
 from torchqm.testing import assert_orbit_equal
 
@@ -138,6 +138,32 @@ def test_it_stops_when_the_map_stays(pair, monkeypatch):
     assert 3 < len(calls) < 20
 
 
+@pytest.mark.parametrize("steps", [1, 4])
+def test_a_restricted_target_is_searched_at_those_vertices_only(pair, steps):
+    """Restricting a basis is the same as keeping those vertices of it; partners come from among them."""
+    ids = torch.randperm(642, generator=torch.Generator().manual_seed(1))[:150]
+    small = pair.even_y.restricted(ids)
+    rows = SpectralBasis(pair.even_y.evals, pair.even_y.evecs[ids], pair.even_y.mass[ids])
+    start = pair.even + 0.08 * noise(*pair.even.shape)
+    for width in (None, 0.3):
+        options = {"steps": steps, "width": width}
+        found = quotient_icp(start, pair.even_x, small, pair.samples, **options)
+        assert torch.equal(found, quotient_icp(start, pair.even_x, rows, pair.samples, **options))
+        assert not torch.equal(found, quotient_icp(start, pair.even_x, pair.even_y, pair.samples, **options))
+    once = quotient_icp(start, pair.even_x, small, pair.samples, steps=1)
+    torch.testing.assert_close(once, dense.icp_step(start, pair.even_x, rows, pair.samples), atol=1e-9, rtol=0)
+    everything = torch.randperm(642, generator=torch.Generator().manual_seed(2))  # in another order only
+    found = quotient_icp(start, pair.even_x, pair.even_y.restricted(everything), pair.samples, steps=30)
+    torch.testing.assert_close(found, pair.even, atol=1e-7, rtol=0)
+
+
+def test_upsampling_among_some_vertices_comes_close(pair):
+    ids = torch.randperm(642, generator=torch.Generator().manual_seed(1))[:400]
+    exact = p2p_to_fmap(pair.copy.p2p_yx, pair.full_x, pair.full_y)
+    found = upsample(exact[:15, :15], pair.full_x, pair.full_y.restricted(ids), torch.arange(642), growing_sizes(15, K))
+    assert (found - exact).norm() < 0.1 * exact.norm()
+
+
 def test_no_steps_change_nothing(pair):
     assert quotient_icp(pair.even, pair.even_x, pair.even_y, pair.samples, steps=0) is pair.even
 
@@ -170,16 +196,6 @@ def test_semi_quotient_icp_comes_back_to_the_exact_map(pair, seed):
     assert (refined.T @ refined - on_even).norm() < 0.1 * (start.T @ start - on_even).norm()
 
 
-def test_upsampling_sizes():
-    assert upsampling_sizes(30, 100, 30) == [60, 90, 100]
-    assert upsampling_sizes(30, 90, 30) == [60, 90]
-    assert upsampling_sizes(30, 30, 5) == [30]
-    assert upsampling_sizes(30, 20, 5) == [20]
-    for step, stop in ((0, 10), (5, 0)):
-        with pytest.raises(ValueError, match=f"step={step}, stop={stop}"):
-            upsampling_sizes(3, stop, step)
-
-
 def test_growing_sizes():
     assert growing_sizes(30, 60, 1.5) == [45, 60]
     assert growing_sizes(1, 4, 1.01) == [2, 3, 4]  # by one at least
@@ -195,7 +211,7 @@ def test_growing_sizes():
 @pytest.mark.parametrize("steps", [1, 3])
 def test_upsample_reaches_the_exact_map(pair, steps):
     start = pair.even[:10, :10] + 0.05 * noise(10, 10)
-    sizes = upsampling_sizes(10, pair.even_x.k, 4)
+    sizes = growing_sizes(10, pair.even_x.k)
     found = upsample(start, pair.even_x, pair.even_y, pair.samples, sizes, steps)
     assert found.shape == (pair.even_y.k, pair.even_x.k)
     torch.testing.assert_close(found, pair.even, atol=1e-7, rtol=0)
@@ -205,7 +221,7 @@ def test_upsample_reaches_the_exact_map(pair, steps):
 def test_upsample_full_bases_finds_the_isometry(pair):
     exact = p2p_to_fmap(pair.copy.p2p_yx, pair.full_x, pair.full_y)
     start = exact[:15, :15] + 0.05 * noise(15, 15)
-    found = upsample(start, pair.full_x, pair.full_y, pair.samples, upsampling_sizes(15, K, 5))
+    found = upsample(start, pair.full_x, pair.full_y, pair.samples, growing_sizes(15, K))
     torch.testing.assert_close(found, exact, atol=1e-7, rtol=0)
     assert torch.equal(fmap_to_p2p(found, pair.full_x, pair.full_y), pair.copy.p2p_xy)
 
@@ -214,7 +230,7 @@ def test_upsample_full_bases_finds_the_isometry(pair):
 def test_semi_upsample_reaches_the_exact_map(pair, width):
     start = p2p_to_fmap(pair.copy.p2p_yx, pair.full_x.truncate(15), pair.even_y.truncate(9)) + 0.02 * noise(9, 15)
     everywhere = torch.arange(642)
-    found = semi_upsample(start, pair.full_x, pair.even_y, everywhere, [*upsampling_sizes(15, K, 5), K], width)
+    found = semi_upsample(start, pair.full_x, pair.even_y, everywhere, growing_sizes(15, K), width)
     assert found.shape == (pair.even_y.k, K)
     orbits = pair.copy.shape.group.orbits
     at = fmap_to_p2p(found, pair.full_x, pair.even_y)

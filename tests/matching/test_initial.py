@@ -2,11 +2,11 @@ import pytest
 import torch
 from references import dense
 from references.pairs import FAST, exact_pair, with_loose_vertices
-from references.shapes import basis_of, blob
+from references.shapes import basis_of, blob, prism
 
 from torchqm.fmap import p2p_to_fmap, solve_fmap
 from torchqm.matching import MatchParameters, prepare
-from torchqm.matching.initial import initial_fmap, shared_descriptors, unit_columns_pair
+from torchqm.matching.initial import basis_size, initial_fmap, shared_descriptors, unit_columns_pair
 from torchqm.spectral import heat_times, wave_energies
 from torchqm.symmetry import symmetrized_basis
 
@@ -76,3 +76,26 @@ def test_it_is_the_weighted_least_squares_problem():
     torch.testing.assert_close((a.square().sum(0) + b.square().sum(0)) / 2, torch.ones(15, dtype=torch.float64))
     wanted = solve_fmap(a, b, basis_x.evals, basis_y.evals, 3.0 * 15 / 10)
     torch.testing.assert_close(initial_fmap(basis_x, basis_y, f, g, 3.0), wanted)
+
+
+def test_what_nothing_determines_is_zero():
+    """Odd functions of exactly symmetric twins have no descriptors, and at equal frequency nothing weighs on them."""
+    basis = basis_of(blob(2).mesh, 20)
+    values = shared_descriptors([basis], FAST.changed(k=20))[0]
+    found = initial_fmap(basis, basis, values, values, 100.0)
+    parity = basis.coefficients(basis.evecs[blob(2).group.maps[1]]).diagonal()
+    assert 5 < int((parity < 0).sum()) < 15
+    torch.testing.assert_close(found, torch.diag((parity > 0).double()), atol=1e-4, rtol=0)
+
+
+def test_no_cluster_is_cut():
+    simple, paired = basis_of(blob(2).mesh, 30), basis_of(prism().mesh, 30)
+    same = paired.evals[1:].diff().abs() < 1e-6 * paired.evals[2:]
+    assert int(same.sum()) > 5
+    for k in range(4, 30):
+        size = basis_size([simple, paired], k)
+        assert k - 1 <= size <= k
+        assert not same[size - 2]  # function number `size` is another frequency than the last one kept
+        assert size == k or same[k - 2]
+        assert basis_size([simple], k) == k
+    assert basis_size([simple, paired.truncate(10)], 25) == 10

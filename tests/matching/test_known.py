@@ -23,11 +23,12 @@ def test_no_symmetry(exact):
     assert torch.equal(known.group.maps, torch.arange(642)[None])
     assert torch.equal(known.sign, torch.zeros(642, dtype=torch.float64))
     assert (known.known, known.origin, known.warnings) == (False, "none", ["why"])
+    assert not no_symmetry(exact.x).firm
 
 
 def test_mirror_plane(exact, known):
     assert torch.equal(known.group.maps, exact.group_x.maps)
-    assert (known.known, known.origin, known.warnings) == (True, "extrinsic", [])
+    assert (known.known, known.firm, known.origin, known.warnings) == (True, True, "extrinsic", [])
     assert known.details["residual"] < 1e-6
     assert abs(known.details["normal"][0]) == pytest.approx(1)
 
@@ -56,6 +57,7 @@ def test_a_lopsided_shape_has_the_trivial_group(lopsided):
 
 def test_a_rough_plane_is_used_and_told(lopsided):
     known = extrinsic_symmetry(lopsided, max_residual=1.0)
+    assert (known.known, known.firm) == (True, False)
     assert known.group.order == 2
     assert "fits only roughly" in known.warnings[0]
     assert f"rms {known.details['residual']:.4f}" in known.warnings[0]
@@ -89,7 +91,10 @@ class TestGiven:
             (lambda maps: maps[:, :600], "600 entries a row, but blob2 has 642 vertices"),
             (lambda maps: maps.flip(0), "row 0 must be the identity"),
             (lambda maps: maps + torch.tensor([[0], [1]]), r"ids must lie in 0\.\.641"),
-            (lambda maps: torch.stack([maps[0], maps[0].roll(160)]), "row 1 of the symmetry is no reflection: .* 0.1 is"),
+            (
+                lambda maps: torch.stack([maps[0], maps[0].roll(160)]),
+                "row 1 of the symmetry is no reflection: .* 0.1 is",
+            ),
             (lambda maps: exact_pair(4).group_x.maps, "blob2: the symmetry has 4 elements"),
         ],
         ids=["length", "identity", "ids", "involution", "order"],

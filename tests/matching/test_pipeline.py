@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 import torch
 from references.pairs import FAST, blob_meshes, exact_pair, mirrored, posed, reordered, with_loose_vertices
-from references.shapes import blob, rotation
+from references.shapes import blob, prism, rotation
 
 import torchqm.matching.pipeline as module
 from torchqm.data.synthetic import creature, exact_maps, symmetry_truth
+from torchqm.fmap import fmap_to_p2p
 from torchqm.geometry import Mesh, MeshError, save_mesh
 from torchqm.matching import Collection, extrinsic_symmetry, find_symmetry, match, match_prepared, no_symmetry, prepare
 from torchqm.spectral import SpectrumError
@@ -80,6 +81,13 @@ class TestPosedPair:
         assert torch.equal(result.orbits, result.maps.T)
         assert torch.equal(result.symmetry_target[0], torch.arange(n[1]))
         assert result.maps.dtype == torch.int64
+
+    def test_each_row_has_its_functional_map(self, result, meshes):
+        x, y = (prepare(mesh, FAST.k_max).basis for mesh in meshes[:2])
+        for fmap, p2p in zip(result.fmaps, result.maps, strict=True):
+            assert float((fmap_to_p2p(fmap, x, y) == p2p).double().mean()) > 0.7
+            pushed = y.evecs[p2p]
+            assert (x.evecs @ fmap.T - pushed).norm() < 0.5 * pushed.norm()
 
     def test_functional_maps_and_scores(self, result):
         k = FAST.k_max
@@ -275,9 +283,7 @@ class TestMethodsOnAnExactPair:
         shape, copy = blob_meshes()
         exact = exact_pair()
         wanted = torch.stack([exact.p2p_xy, exact.group_y.maps[1][exact.p2p_xy]])
-        both = match(
-            shape.mesh, copy.mesh, symmetry=copy.group.maps, symmetry_source=shape.group.maps, parameters=FAST
-        )
+        both = match(shape.mesh, copy.mesh, symmetry=copy.group.maps, symmetry_source=shape.group.maps, parameters=FAST)
         assert torch.equal(both.maps, wanted)
         assert torch.equal(both.symmetry_source, shape.group.maps)
         assert not any("plane" in step or "transfer" in step for step in both.seconds)
@@ -294,6 +300,89 @@ class TestMethodsOnAnExactPair:
         assert found.details[other]["symmetry"] == "extrinsic"
         assert found.labels == ("direct", "mirrored")
         assert float(errors(found.maps, first, second).diagonal().max()) < 0.5
+
+
+class TestDoubtfulSymmetries:
+    """A plane that fits only roughly gives way to a firm one; what was given or transferred stays."""
+
+    @pytest.fixture
+    def doubt(self, monkeypatch):
+        """Make the mirror plane of the shapes of these names doubtful."""
+        names = []
+
+        def find(shape):
+            found = extrinsic_symmetry(shape)
+            return replace(found, warnings=["rough"]) if shape.mesh.name in names else found
+
+        monkeypatch.setattr(module, "extrinsic_symmetry", find)
+        return names
+
+    @pytest.mark.parametrize("name", ["blob2", "copy"])
+    def test_one_of_two_planes(self, doubt, name):
+        shape, copy = blob_meshes()
+        doubt.append(name)
+        found = match(shape.mesh, copy.mesh, parameters=FAST)
+        origins = [found.details[side]["symmetry"] for side in ("source", "target")]
+        assert origins == (["transfer", "extrinsic"] if name == "blob2" else ["extrinsic", "transfer"])
+        assert "rough" not in found.warnings
+        assert float((found.maps[0] == exact_pair().p2p_xy).double().mean()) > 0.99
+
+    def test_both(self, doubt):
+        shape, copy = blob_meshes()
+        doubt.extend(["blob2", "copy"])
+        found = match(shape.mesh, copy.mesh, parameters=FAST)
+        assert [found.details[side]["symmetry"] for side in ("source", "target")] == ["extrinsic", "extrinsic"]
+        assert found.warnings == ["rough"]
+
+    @pytest.mark.parametrize("given", ["source", "target"])
+    def test_a_given_symmetry_is_never_replaced(self, monkeypatch, given):
+        shape, copy = blob_meshes()
+        inner = module.given_symmetry
+        monkeypatch.setattr(module, "given_symmetry", lambda *a: replace(inner(*a), warnings=["unclear halves"]))
+        options = {"symmetry_source": shape.group.maps} if given == "source" else {"symmetry": copy.group.maps}
+        found = match(shape.mesh, copy.mesh, parameters=FAST, **options)
+        assert found.details[given]["symmetry"] == "file"
+        assert found.warnings == ["unclear halves"]
+
+    def test_the_reference_gives_both_shapes_theirs(self, monkeypatch):
+        shape, copy = blob_meshes()
+        inner, done = module.transferred_symmetry, []
+
+        def unclear(moved, reference, *rest):
+            done.append((moved.mesh.name, reference.mesh.name))
+            return replace(inner(moved, reference, *rest), warnings=["unclear"])
+
+        monkeypatch.setattr(module, "transferred_symmetry", unclear)
+        found = match(shape.mesh, copy.mesh, reference=copy.mesh, parameters=FAST)
+        assert done == [("blob2", "copy")]
+        assert found.warnings == ["unclear"]
+
+
+class TestEqualEigenvalues:
+    def test_an_exactly_symmetric_shape_with_no_symmetry_told(self):
+        """Nothing says how its odd functions go; a map comes back all the same, and the warning."""
+        shape, copy = blob_meshes()
+        found = match(shape.mesh, copy.mesh, symmetry="none", parameters=FAST)
+        assert found.maps.shape == (1, 642)
+        orbit = exact_pair().group_y.orbits[found.maps[0]]
+        assert float((orbit == exact_pair().p2p_xy[:, None]).any(1).double().mean()) > 0.5
+        assert any("possibly a mixture" in text for text in found.warnings)
+
+    def test_pairs_of_equal_eigenvalues_are_told(self):
+        mesh = prism().mesh
+        target, *_ = reordered(mesh, 1)
+        found = match(mesh, target, parameters=FAST)
+        assert sum("ambiguous spectrum" in text for text in found.warnings) == 2
+        assert torch.isfinite(found.fmaps).all()
+
+    @pytest.mark.parametrize("method", ["quotient", "semi"])
+    def test_k_is_lowered_to_the_end_of_a_cluster(self, method):
+        mesh = prism().mesh
+        evals = prepare(mesh, 30).basis.evals
+        k = next(k for k in range(10, 30) if float(evals[k] - evals[k - 1]) < 1e-6 * float(evals[k]))
+        found = match(mesh, mesh, method=method, parameters=FAST.changed(k=k))
+        assert any(f"k is {k - 1} instead of {k}" in text for text in found.warnings)
+        assert found.maps.shape == (2, mesh.n_verts)
 
 
 class TestOrientation:

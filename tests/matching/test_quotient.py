@@ -84,6 +84,12 @@ class TestChooseHalves:
         for side in (torch.ones(642).double(), torch.zeros(642).double()):
             assert torch.equal(choose_halves(orbit_map, exact.group_y, -torch.ones(642).double(), side), orbit_map)
 
+    def test_an_axis_is_no_half(self):
+        """Where the target's signs are not symmetric themselves, a vertex on no side still keeps its point."""
+        group = SymmetryGroup(torch.tensor([[0, 1, 2], [1, 0, 2]]))
+        signs = torch.tensor([[0.0, 1.0, -1.0], [1.0, 0.0, -1.0]], dtype=torch.float64)
+        assert choose_halves(torch.zeros(3).long(), group, *signs).tolist() == [0, 0, 0]
+
     @pytest.mark.parametrize("order", [1, 4])
     def test_other_groups(self, exact, order):
         pair = exact_pair(order)

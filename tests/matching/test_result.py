@@ -105,7 +105,7 @@ def test_json_is_whole_or_not_there(tmp_path):
     assert "größe" in path.read_text(encoding="utf-8")
     endless: dict = {}
     endless["self"] = endless
-    with pytest.raises(ValueError, match="[Cc]ircular"):
+    with pytest.raises(ValueError, match="ircular"):
         write_json(tmp_path / "other.json", endless)
     assert os.listdir(tmp_path) == ["summary.json"]
 

@@ -32,7 +32,9 @@ def moved_wrongly(pair, reflection):
     return wrong / float(pair.x.mesh.edge_lengths.mean())
 
 
-@pytest.mark.parametrize("options", [{}, {"way": "clustering"}, {"way": "clustering", "distance": "extrinsic"}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"way": "clustering"}, {"way": "clustering", "distance": "extrinsic"}], ids=str
+)
 def test_the_exact_reflection_comes_over(either, options):
     found = transfer(either, **options)
     assert float((moved_wrongly(either, found.group.maps[1]) < 1).double().mean()) >= 0.99

@@ -67,8 +67,13 @@ def side_of(shape: PreparedShape, group: SymmetryGroup) -> Tensor:
     return torch.where(stays, 0.0, torch.sign(shape.mesh.verts[:, 0]))
 
 
-@lru_cache
 def exact_pair(order: int = 2, mirror: bool = False) -> ExactPair:
+    """Made once for the whole run."""
+    return _exact_pair(order, mirror)
+
+
+@lru_cache
+def _exact_pair(order: int, mirror: bool) -> ExactPair:
     if mirror:
         pair = exact_pair(order)
         return pair._replace(y=prepare(mirrored(renumbered(blob(order), 2).shape.mesh), K))

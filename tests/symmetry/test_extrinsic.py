@@ -95,7 +95,7 @@ def test_same_seed_same_answer_and_group():
 
 def test_few_samples_are_enough_for_an_exact_plane():
     mesh, group = blob(2)
-    found = find_reflection(mesh.moved(mesh.verts @ rotation(1).T), n_samples=50, n_refine=1)
+    found = find_reflection(mesh.moved(mesh.verts @ rotation(1).T), n_samples=50)
     assert torch.equal(found.map, group.maps[1])
     assert isinstance(found.offset, float)
     assert np.isfinite(found.spacing)

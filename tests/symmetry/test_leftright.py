@@ -1,15 +1,122 @@
-"""torchqm.symmetry.leftright: two parts of a height function with known peaks, saddle and areas."""
+"""torchqm.symmetry.leftright: displacement in closed form; two parts of a height function with known peaks."""
 
 from math import inf
 
+import numpy as np
 import pytest
 import torch
-from references.shapes import grid
+from references.shapes import blob, grid, group_of, icosphere
+from references.unchecked import unchecked
 
 from torchqm.geometry import Mesh
-from torchqm.symmetry import LeftRight, persistence_clusters
+from torchqm.symmetry import LeftRight, displacement, halves_of_reflection, persistence_clusters
 
 SIGN = torch.ones(3, dtype=torch.float64)
+
+
+def reflection_of(mesh, signs=(-1.0, 1.0, 1.0)):
+    return group_of(mesh.verts.numpy(), [np.eye(3), np.diag(signs)]).maps[1]
+
+
+class TestDisplacement:
+    @pytest.mark.parametrize("by", ["side", "map"])
+    def test_sphere(self, by):
+        """``d(x, S x) = 2 asin |x|`` on the unit sphere, within the error of the solver, which falls with the edges."""
+        worst = []
+        for level in (3, 4):
+            ball = icosphere(level)
+            x = ball.verts[:, 0]
+            found = displacement(ball, reflection_of(ball), side=x if by == "side" else None)
+            error = found - 2 * torch.asin(x.abs().clamp(max=1))
+            assert float(error.abs().mean()) < 0.02
+            worst.append(float(error.abs().max()))
+            assert worst[-1] < 0.7 * float(ball.edge_lengths.max())
+        assert worst[1] < 0.7 * worst[0]
+
+    @pytest.mark.parametrize("by", ["side", "map"])
+    def test_box(self, box, by):
+        """Flat sides, so the distances are exact: along a side to the middle, and over the edge from an end."""
+        x, y, z = box.mesh.verts.T.abs()
+        over_the_edge = 0.7 + torch.minimum(0.5 - y, 0.4 - z)
+        wanted = 2 * torch.where(x > 0.7 - 1e-9, over_the_edge, x)
+        side = box.mesh.verts[:, 0] if by == "side" else None
+        found = displacement(box.mesh, reflection_of(box.mesh), side=side)
+        torch.testing.assert_close(found, wanted, atol=1e-9, rtol=0)
+
+    def test_axis_from_the_map_is_the_axis_from_the_side(self):
+        """On a bumpy shape, where some vertices lie on the axis and some edges cross it."""
+        shape = blob(2)
+        mesh, reflection = shape.mesh, shape.group.maps[1]
+        assert bool((reflection == torch.arange(642)).any())
+        i, j = mesh.edges.T
+        assert bool(((reflection[i] == j) & (i != j)).any())
+        from_map, from_side = displacement(mesh, reflection), displacement(mesh, reflection, side=mesh.verts[:, 0])
+        near = 0.02 * float(mesh.edge_lengths.mean())  # the solver starts from other points of one and the same curve
+        torch.testing.assert_close(from_map, from_side, atol=near, rtol=0)
+        torch.testing.assert_close(from_map, from_map[reflection], atol=near, rtol=0)  # it is symmetric
+
+    def test_only_the_sign_changes_of_the_side_count(self, box):
+        x = box.mesh.verts[:, 0]
+        reflection = reflection_of(box.mesh)
+        wanted = displacement(box.mesh, reflection, side=x)
+        torch.testing.assert_close(displacement(box.mesh, reflection, side=-5 * x), wanted)
+
+    def test_extrinsic_is_the_straight_segment(self):
+        shape = blob(2)
+        found = displacement(shape.mesh, shape.group.maps[1], "extrinsic")
+        torch.testing.assert_close(found, 2 * shape.mesh.verts[:, 0].abs(), atol=1e-12, rtol=0)
+        intrinsic = displacement(shape.mesh, shape.group.maps[1])
+        assert bool((intrinsic > found - 1e-9).all())
+
+    def test_units(self, box):
+        reflection = reflection_of(box.mesh)
+        wanted = displacement(box.mesh, reflection)
+        for scale in (1e-6, 1e6):
+            found = displacement(box.mesh.moved(box.mesh.verts * scale), reflection)
+            torch.testing.assert_close(found / scale, wanted)
+
+    def test_vertices_of_no_face_are_not_moved(self, box):
+        verts = torch.cat([box.mesh.verts, torch.full((2, 3), 5.0, dtype=torch.float64)])
+        reflection = torch.cat([reflection_of(box.mesh), torch.tensor([box.mesh.n_verts + 1, box.mesh.n_verts])])
+        found = displacement(Mesh(verts, box.mesh.faces), reflection)
+        assert found[-2:].tolist() == [0, 0]
+        torch.testing.assert_close(found[:-2], displacement(box.mesh, reflection[:-2]))
+
+    def test_no_axis(self, box):
+        """The antipodal map of a box fixes no point; nor does a side of one sign change it."""
+        antipodal = reflection_of(box.mesh, (-1.0, -1.0, -1.0))
+        for options in ({}, {"side": torch.ones(box.mesh.n_verts, dtype=torch.float64)}):
+            with pytest.raises(ValueError, match=r"box: the symmetry map has no axis .* kind='extrinsic'"):
+                displacement(box.mesh, antipodal, **options)
+        wanted = 2 * box.mesh.verts.norm(dim=1)
+        torch.testing.assert_close(displacement(box.mesh, antipodal, "extrinsic"), wanted)
+
+    def test_unknown_kind(self, box):
+        with pytest.raises(ValueError, match="kind='biharmonic': allowed are 'intrinsic' and 'extrinsic'"):
+            unchecked(displacement)(box.mesh, reflection_of(box.mesh), "biharmonic")
+
+
+class TestHalvesOfReflection:
+    def test_left_right_and_the_axis(self):
+        shape = blob(2)
+        reflection, x = shape.group.maps[1], shape.mesh.verts[:, 0]
+        stays = reflection == torch.arange(642)
+        found = halves_of_reflection(shape.mesh, reflection, x)
+        assert torch.equal(found, torch.where(stays, 0.0, torch.sign(x)))
+        assert torch.equal(found[reflection], -found)
+
+    def test_rounding_decides_nothing_on_the_axis(self):
+        shape = blob(2)
+        reflection, x = shape.group.maps[1], shape.mesh.verts[:, 0]
+        wanted = halves_of_reflection(shape.mesh, reflection, x)
+        for shift in (-1e-9, 1e-9):
+            assert torch.equal(halves_of_reflection(shape.mesh, reflection, x + shift), wanted)
+
+    def test_symmetric_parts_of_the_side_drop_out(self):
+        shape = blob(2)
+        reflection, (x, y, z) = shape.group.maps[1], shape.mesh.verts.T
+        wanted = halves_of_reflection(shape.mesh, reflection, x)
+        assert torch.equal(halves_of_reflection(shape.mesh, reflection, 0.1 * x + 3 * y + z * x * x), wanted)
 
 
 def strip(n=31):

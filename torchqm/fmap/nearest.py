@@ -117,7 +117,7 @@ class SurfaceSearch:
         for stage in found.T:
             order = np.argsort(stage, kind="stable")
             anchors, starts = np.unique(stage[order], return_index=True)
-            for anchor, mine in zip(anchors, np.split(order, starts[1:]), strict=True):
+            for anchor, mine in zip(anchors, np.split(order, starts)[1:], strict=True):
                 near = around[anchor]
                 value = queries32[mine] @ points32[near].T - half[near]
                 which = value.argmax(1)

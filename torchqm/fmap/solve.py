@@ -16,6 +16,7 @@ def solve_fmap(
     evals_y: Float[Tensor, " Ky"],
     weight: float = 1.0,
     normalize: bool = True,
+    ridge: float = 0.0,
 ) -> Float[Tensor, "Ky Kx"]:
     """Minimise ``sum_s || C f_s - g_s ||^2 + w sum_ij C_ij^2 (lambda_j - mu_i)^2`` over all matrices C.
 
@@ -28,6 +29,8 @@ def solve_fmap(
         evals_x: ``(Kx,)`` eigenvalues of the source basis; Kx and Ky may differ (semi-quotient).
         evals_y: ``(Ky,)`` eigenvalues of the target basis.
         weight: w, with eigenvalues scaled to ``[0, 1]`` if ``normalize``.
+        ridge: multiple of the mean descriptor energy added to every diagonal: entries of C that neither descriptors nor
+            commutativity determine become 0 instead of an error.
         normalize: divide both spectra by the larger of their maxima, so that ``weight`` has no unit.
 
     Returns:
@@ -55,12 +58,13 @@ def solve_fmap(
             f"coefficients of {coeffs_x.shape[0]} and {coeffs_y.shape[0]} basis functions do not fit "
             f"{evals_x.shape[0]} and {evals_y.shape[0]} eigenvalues"
         )
-    if weight < 0:
-        raise ValueError(f"weight={weight}: the commutativity weight must not be negative")
+    if weight < 0 or ridge < 0:
+        raise ValueError(f"weight={weight}, ridge={ridge}: neither may be negative")
     if normalize:
         scale = torch.maximum(evals_x.max(), evals_y.max()).clamp_min(1e-300)
         evals_x, evals_y = evals_x / scale, evals_y / scale
     gram = coeffs_x @ coeffs_x.T
+    gram = gram + ridge * gram.diagonal().mean() * torch.eye(gram.shape[0], dtype=gram.dtype)
     systems = gram[None] + torch.diag_embed(weight * commutativity_weights(evals_x, evals_y))
     factor, info = torch.linalg.cholesky_ex(systems)
     diagonal = factor.diagonal(dim1=1, dim2=2)

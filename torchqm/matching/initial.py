@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchqm.fmap.solve import solve_fmap
 from torchqm.matching.parameters import MatchParameters
-from torchqm.spectral.basis import SpectralBasis
+from torchqm.spectral.basis import SpectralBasis, cluster_end
 from torchqm.spectral.descriptors import (
     heat_kernel_signature,
     heat_times,
@@ -18,7 +18,15 @@ from torchqm.spectral.descriptors import (
     wave_kernel_signature,
 )
 
-__all__ = ["initial_fmap", "shared_descriptors"]
+__all__ = ["basis_size", "initial_fmap", "shared_descriptors"]
+
+
+def basis_size(bases: Sequence[SpectralBasis], k: int) -> int:
+    """The largest size up to ``k`` at which no shape's spectrum is cut inside a cluster of equal eigenvalues.
+
+    A cluster cut in two is not a space that a symmetry keeps, so its functions could neither be split nor matched.
+    """
+    return min(cluster_end(b.evals, min(k, b.k), rtol=1e-4) for b in bases)
 
 
 def shared_descriptors(bases: Sequence[SpectralBasis], parameters: MatchParameters) -> list[Float[Tensor, "_V C"]]:
@@ -58,7 +66,8 @@ def initial_fmap(
     """
     coeffs_x, coeffs_y = unit_columns_pair(basis_x.coefficients(values_x), basis_y.coefficients(values_y))
     weight = commutativity * coeffs_x.shape[1] / basis_x.k
-    return solve_fmap(coeffs_x, coeffs_y, basis_x.evals, basis_y.evals, weight)
+    # Exactly symmetric twins have odd functions without descriptors at equal frequencies: nothing is known of these.
+    return solve_fmap(coeffs_x, coeffs_y, basis_x.evals, basis_y.evals, weight, ridge=1e-9)
 
 
 def unit_columns_pair(

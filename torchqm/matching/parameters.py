@@ -17,6 +17,8 @@ class MatchParameters:
         splits: intervals s of the splitting (the paper: 5; 0 leaves it out).
         commutativity: weight w of the commutativity term, times the number of descriptors per basis function, with
             eigenvalues scaled to [0, 1].
+        self_commutativity: the same weight for the map of a shape to itself, whose descriptors agree exactly and so may
+            decide more (on the cats a weight of 1 halves the error that 100 gives).
         icp_steps: steps of (semi-)quotient ICP (the paper: 20).
         time: diffusion time of the deltas (1 = the area of the shape).
         n_samples: vertices, drawn by area, that stand for the surface.
@@ -32,6 +34,7 @@ class MatchParameters:
     n_descriptors: int = 100
     splits: int = 5
     commutativity: float = 100.0
+    self_commutativity: float = 1.0
     icp_steps: int = 20
     time: float = 0.0
     n_samples: int = 2000
@@ -51,7 +54,7 @@ class MatchParameters:
         for name in ("n_descriptors", "n_samples"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: must be at least 1")
-        for name in ("splits", "icp_steps", "commutativity", "time"):
+        for name in ("splits", "icp_steps", "commutativity", "self_commutativity", "time"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}={getattr(self, name)}: must not be negative")
 

@@ -11,6 +11,7 @@ from torchqm.fmap.refine import correspondence_fmap
 from torchqm.geometry.check import check_mesh
 from torchqm.geometry.io import load_mesh
 from torchqm.geometry.mesh import Mesh
+from torchqm.matching.initial import basis_size
 from torchqm.matching.known import (
     KnownSymmetry,
     extrinsic_symmetry,
@@ -214,10 +215,9 @@ class Collection:
             raise ValueError(f"symmetry={symmetry!r}: allowed are 'extrinsic', 'none' or a table of vertex maps")
         if known_x is None and (isinstance(symmetry, str) or self.method != "semi"):
             known_x = self.symmetry(x)
-        # A doubtful plane of one's own (a pose that is nearly symmetric) gives way to a transfer from a firm one.
-        if known_x is None or (known_y.known and not known_x.known) or (known_y.firm and not known_x.firm):
+        if known_x is None or _gives_way(known_x, known_y):
             known_x = self.transfer(x, y, known_y)
-        elif (known_x.known and not known_y.known) or (known_x.firm and not known_y.firm):
+        elif _gives_way(known_y, known_x):
             known_y = self.transfer(y, x, known_x)
         return known_x, known_y
 
@@ -261,6 +261,10 @@ def match_prepared(
             "matched with the identity alone"
         )
         known_x, known_y = no_symmetry(x), no_symmetry(y)
+    k = basis_size([x.basis, y.basis], parameters.k)
+    if k < parameters.k:
+        warnings.append(f"k is {k} instead of {parameters.k}: the next eigenvalues equal the one before them")
+    warnings += [text for shape in (x, y) if (text := _spectrum_warning(shape, k))]
     details: dict[str, Any] = {
         "source": {"name": x.mesh.label, "vertices": x.n_verts, "laplacian": x.operator, "symmetry": known_x.origin}
         | known_x.details,
@@ -295,7 +299,6 @@ def match_prepared(
             p2p = dense_map(fmap, x, y)
     with steps("scores and labels"):
         if fmap is None:
-            k = parameters.k
             fmap = correspondence_fmap(p2p, x.basis.truncate(k), y.basis.truncate(k), x.samples)
         maps = known_y.group.maps[:, p2p]
         agreement = [orientation_agreement(x.mesh, y.mesh, m) for m in maps]
@@ -328,6 +331,27 @@ def match_prepared(
         parameters=parameters.as_dict(),
         seconds=dict(steps.seconds),
         details=details,
+    )
+
+
+def _gives_way(mine: KnownSymmetry, other: KnownSymmetry) -> bool:
+    """Whether a transfer from the other shape is better than what is known here.
+
+    A doubtful plane of one's own (a pose that is nearly symmetric) gives way to a firm symmetry of the other shape;
+    what the user or the reference gave does not.
+    """
+    return (other.known and not mine.known) or (other.firm and not mine.firm and mine.origin == "extrinsic")
+
+
+def _spectrum_warning(shape: PreparedShape, k: int, rtol: float = 1e-3, most: float = 0.2) -> str | None:
+    """What to say of a spectrum with many equal eigenvalues: a rotation mixes the functions that share one."""
+    evals = shape.basis.evals[1:k]
+    equal = int((evals.diff() < rtol * evals[1:]).sum())
+    if equal <= most * k:
+        return None
+    return (
+        f"{shape.mesh.label}: ambiguous spectrum: {equal} of the first {k} eigenvalues equal their neighbour to "
+        f"{rtol:g}; the shape has more symmetry than one reflection, and which functions belong together is arbitrary"
     )
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchqm.fmap.convert import fmap_to_p2p
 from torchqm.fmap.refine import correspondence_fmap, growing_sizes, quotient_icp, upsample
-from torchqm.matching.initial import initial_fmap, shared_descriptors
+from torchqm.matching.initial import basis_size, initial_fmap, shared_descriptors
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.shape import PreparedShape
@@ -57,8 +57,9 @@ def match_quotient(
     References:
         Paper, section 4.3 and 4.4.
     """
-    source = symmetrized_basis(x.basis.truncate(parameters.k), group_x)
-    target = symmetrized_basis(y.basis.truncate(parameters.k), group_y)
+    k = basis_size([x.basis, y.basis], parameters.k)
+    source = symmetrized_basis(x.basis.truncate(k), group_x)
+    target = symmetrized_basis(y.basis.truncate(k), group_y)
     values_x, values_y = shared_descriptors([x.basis, y.basis], parameters)
     fmap = initial_fmap(source.even, target.even, values_x, values_y, parameters.commutativity)
     samples, among = x.samples[: parameters.n_samples], target.even.restricted(y.anchors)

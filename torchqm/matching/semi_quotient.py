@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchqm.fmap.convert import fmap_to_p2p
 from torchqm.fmap.refine import growing_sizes, nearest_isometry, semi_quotient_icp, semi_upsample
-from torchqm.matching.initial import initial_fmap, shared_descriptors
+from torchqm.matching.initial import basis_size, initial_fmap, shared_descriptors
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.shape import PreparedShape
 from torchqm.symmetry.basis import SymmetrizedBasis, split_by_projector, symmetrized_basis
@@ -52,8 +52,9 @@ def match_semi_quotient(
     References:
         Paper, section 5 and Lemma 5.1.
     """
-    basis_x = x.basis.truncate(parameters.k)
-    target = symmetrized_basis(y.basis.truncate(parameters.k), group_y)
+    k = basis_size([x.basis, y.basis], parameters.k)
+    basis_x = x.basis.truncate(k)
+    target = symmetrized_basis(y.basis.truncate(k), group_y)
     values_x, values_y = shared_descriptors([x.basis, y.basis], parameters)
     fmap = initial_fmap(basis_x, target.even, values_x, values_y, parameters.commutativity)
     samples = x.samples[: parameters.n_samples]

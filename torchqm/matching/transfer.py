@@ -9,7 +9,7 @@ from torch import Tensor
 from torchqm.fmap.convert import fmap_to_p2p
 from torchqm.fmap.refine import growing_sizes, quotient_icp, upsample
 from torchqm.fmap.solve import solve_fmap
-from torchqm.matching.initial import shared_descriptors, unit_columns_pair
+from torchqm.matching.initial import basis_size, shared_descriptors, unit_columns_pair
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.quotient import dense_map
@@ -59,6 +59,7 @@ def transfer_symmetry(
     parameters: MatchParameters,
     way: str = "full_map",
     distance: str = "intrinsic",
+    semi: SemiQuotientMatch | None = None,
 ) -> SymmetryTransfer:
     """Semi-quotient match to the reference, left and right of the source, self-map of the source.
 
@@ -71,6 +72,7 @@ def transfer_symmetry(
         way: how left and right are found: ``clustering`` (the paper's, :func:`halves_by_clustering`) or ``full_map``
             (:func:`halves_by_full_map`, which measures better and also knows direct from mirrored).
         distance: for ``clustering``: ``intrinsic`` or ``extrinsic``.
+        semi: the semi-quotient match of the two, if it is there already.
 
     Raises:
         ValueError: the group is not one reflection, or an unknown ``way``.
@@ -80,7 +82,7 @@ def transfer_symmetry(
     """
     if group_y.order != 2:
         raise ValueError(f"group_y has {group_y.order} elements: symmetry transfer needs one reflection, {{id, S}}")
-    semi = match_semi_quotient(x, y, group_y, parameters)
+    semi = match_semi_quotient(x, y, group_y, parameters) if semi is None else semi
     halves, odd = None, None
     warnings: list[str] = []
     if way == "clustering":
@@ -160,8 +162,8 @@ def halves_by_full_map(
     fmap = join_blocks(semi.source, semi.target, semi.even, odd.fmap)
     k = min(max(k_sharp, parameters.k), x.basis.k, y.basis.k)
     samples = x.samples[: parameters.n_samples]
-    if k > parameters.k:
-        sizes = growing_sizes(parameters.k, k, parameters.growth)
+    if k > fmap.shape[0]:
+        sizes = growing_sizes(fmap.shape[0], k, parameters.growth)
         fmap = upsample(fmap, x.basis, y.basis.restricted(y.anchors), samples, sizes)
     p2p = dense_map(fmap, x, y)
     return torch.sign(side_y[p2p]), odd
@@ -181,11 +183,11 @@ def self_map_from_halves(
     References:
         Paper, section 6.1, symmetry reconstruction.
     """
-    basis = x.basis.truncate(parameters.k)
+    basis = x.basis.truncate(basis_size([x.basis], parameters.k))
     (values,) = shared_descriptors([x.basis], parameters)
     even, odd = basis.coefficients(values), basis.coefficients(sign[:, None] * values)
     f, g = unit_columns_pair(torch.cat([even, odd], 1), torch.cat([even, -odd], 1))
-    fmap = solve_fmap(f, g, basis.evals, basis.evals, parameters.commutativity * f.shape[1] / basis.k)
+    fmap = solve_fmap(f, g, basis.evals, basis.evals, parameters.self_commutativity * f.shape[1] / basis.k)
     samples = x.samples[: parameters.n_samples]
     among = basis.restricted(x.anchors)
     fmap = quotient_icp(fmap, basis, among, samples, parameters.icp_steps, parameters.time)

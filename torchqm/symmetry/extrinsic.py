@@ -81,7 +81,7 @@ def find_reflection(mesh: Mesh, n_samples: int = 500, n_refine: int = 3, seed: i
     used = np.flatnonzero(weights > 0)
     tree = cKDTree(verts[used])
     few, many = (verts[area_samples(mesh, min(n, used.size), seed).numpy()] for n in (n_samples, 4 * n_samples))
-    coarse = cKDTree(many)
+    coarse = cKDTree(verts[area_samples(mesh, min(5000, used.size), seed).numpy()])
 
     _, axes = np.linalg.eigh((verts * weights[:, None]).T @ verts)
     starts: list[Plane] = [(axis, 0.0) for axis in np.concatenate([axes.T, _half_sphere(45)])]
