@@ -150,8 +150,9 @@ def test_a_restricted_target_is_searched_at_those_vertices_only(pair, steps):
         found = quotient_icp(start, pair.even_x, small, pair.samples, **options)
         assert torch.equal(found, quotient_icp(start, pair.even_x, rows, pair.samples, **options))
         assert not torch.equal(found, quotient_icp(start, pair.even_x, pair.even_y, pair.samples, **options))
-    once = quotient_icp(start, pair.even_x, small, pair.samples, steps=1)
-    torch.testing.assert_close(once, dense.icp_step(start, pair.even_x, rows, pair.samples), atol=1e-9, rtol=0)
+    few = pair.samples[:40]
+    once = quotient_icp(start, pair.even_x, small, few, steps=1)
+    torch.testing.assert_close(once, dense.icp_step(start, pair.even_x, rows, few), atol=1e-9, rtol=0)
     everything = torch.randperm(642, generator=torch.Generator().manual_seed(2))  # in another order only
     found = quotient_icp(start, pair.even_x, pair.even_y.restricted(everything), pair.samples, steps=30)
     torch.testing.assert_close(found, pair.even, atol=1e-7, rtol=0)

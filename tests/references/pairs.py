@@ -14,7 +14,7 @@ from torchqm.matching import MatchParameters, PreparedShape, prepare
 from torchqm.symmetry import SymmetryGroup
 
 K = 60
-FAST = MatchParameters(k_max=K, n_descriptors=40, icp_steps=10)
+FAST = MatchParameters(k_max=K, icp_steps=10)
 """Parameters for meshes of a few hundred vertices, where the full ones only cost time."""
 
 

@@ -97,6 +97,11 @@ def given_symmetry(shape: PreparedShape, maps: Int[Tensor, "G V"], origin: str =
         ValueError: wrong length or ids, row 0 is not the identity, more than one reflection, or a map that is not an
             involution: applied twice, it must bring each point back to within a tenth of sqrt(area) on average.
     """
+    if maps.ndim != 2 or maps.dtype != torch.int64:
+        raise ValueError(
+            f"the symmetry of {shape.mesh.label} must be a (G, V) table of int64 vertex ids, row 0 the identity; "
+            f"got {maps.dtype} of shape {tuple(maps.shape)}"
+        )
     if maps.shape[1] != shape.n_verts:
         raise ValueError(
             f"the symmetry has {maps.shape[1]} entries a row, but {shape.mesh.label} has {shape.n_verts} vertices"

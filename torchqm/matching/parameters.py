@@ -58,6 +58,8 @@ class MatchParameters:
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}={getattr(self, name)}: must not be negative")
 
+        if self.semi_width is not None and self.semi_width <= 0:
+            raise ValueError(f"semi_width={self.semi_width}: must be positive, or None for the iteration as printed")
         if self.growth <= 1:
             raise ValueError(f"growth={self.growth}: the basis must grow, by a ratio above 1")
 

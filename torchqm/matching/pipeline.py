@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -46,8 +47,8 @@ def match(
     source: Mesh | str | Path,
     target: Mesh | str | Path,
     *,
-    symmetry: str | Tensor = "extrinsic",
-    symmetry_source: Tensor | None = None,
+    symmetry: str | Tensor | np.ndarray = "extrinsic",
+    symmetry_source: Tensor | np.ndarray | None = None,
     reference: Mesh | str | Path | None = None,
     method: str = "quotient",
     parameters: MatchParameters | None = None,
@@ -62,7 +63,7 @@ def match(
     Args:
         source: a mesh or its file.
         target: a mesh or its file.
-        symmetry: ``extrinsic``, ``none``, or the target's symmetry as ``(G, V_target)`` vertex maps, identity first.
+        symmetry: ``extrinsic``, ``none``, or the target's symmetry as ``(G, V_target)`` vertex maps (tensor or array).
         symmetry_source: the source's symmetry as vertex maps, if known; else it is found.
         reference: an undeformed pose of the same shape, whose mirror plane gives both shapes their symmetry.
         method: ``quotient`` (default; what measured best), ``paper`` (sections 4 to 7 as printed) or ``semi`` (section
@@ -106,7 +107,7 @@ def find_symmetry(
         The group; trivial, with a warning that gives the residual, if no plane was found.
     """
     collection = Collection(reference, method, parameters, listener)
-    mesh = _as_mesh(mesh)
+    mesh = collection.load(mesh)
     collection.steps.total = collection.expected_work(mesh, match=False)
     shape = collection.shape(mesh)
     known = collection.symmetry(shape)
@@ -151,13 +152,26 @@ class Collection:
         self.way = "full_map" if method == "quotient" else "clustering"
         self._shapes: dict[int, tuple[Mesh, PreparedShape]] = {}
         self._symmetries: dict[int, tuple[PreparedShape, KnownSymmetry]] = {}
-        self._reference = None if reference is None else _as_mesh(reference)
+        self._files: dict[Path, Mesh] = {}
+        self._reference = None if reference is None else self.load(reference)
+
+    def load(self, mesh: Mesh | str | Path) -> Mesh:
+        """The mesh, read from its file the first time that is asked for, and checked."""
+        if isinstance(mesh, Mesh):
+            check_mesh(mesh)
+            return mesh
+        path = Path(mesh).resolve()
+        if path not in self._files:
+            loaded = load_mesh(mesh)
+            check_mesh(loaded)
+            self._files[path] = loaded
+        return self._files[path]
 
     def shape(self, mesh: Mesh | str | Path | PreparedShape) -> PreparedShape:
         """The mesh made ready: checked, scaled to unit area, with its eigenpairs."""
         if isinstance(mesh, PreparedShape):
             return mesh
-        mesh = _as_mesh(mesh)
+        mesh = self.load(mesh)
         if id(mesh) not in self._shapes:
             with self.steps(f"eigenpairs of {mesh.name}", _COST["eigenpairs"] * mesh.n_verts / 1000):
                 k = self.parameters.k_max
@@ -188,11 +202,11 @@ class Collection:
         self,
         source: Mesh | str | Path | PreparedShape,
         target: Mesh | str | Path | PreparedShape,
-        symmetry: str | Tensor = "extrinsic",
-        symmetry_source: Tensor | None = None,
+        symmetry: str | Tensor | np.ndarray = "extrinsic",
+        symmetry_source: Tensor | np.ndarray | None = None,
     ) -> MatchResult:
         """Match two poses; arguments and result as in :func:`match`."""
-        meshes = [m if isinstance(m, PreparedShape) else _as_mesh(m) for m in (source, target)]
+        meshes = [m if isinstance(m, PreparedShape) else self.load(m) for m in (source, target)]
         self.steps.total = self.steps.done + self.expected_work(
             *meshes, symmetries=not isinstance(symmetry, str) or symmetry != "none"
         )
@@ -201,14 +215,22 @@ class Collection:
         return match_prepared(x, y, known_x, known_y, self.method, self.parameters, self.steps)
 
     def _both(
-        self, x: PreparedShape, y: PreparedShape, symmetry: str | Tensor, symmetry_source: Tensor | None
+        self,
+        x: PreparedShape,
+        y: PreparedShape,
+        symmetry: str | Tensor | np.ndarray,
+        symmetry_source: Tensor | np.ndarray | None,
     ) -> tuple[KnownSymmetry, KnownSymmetry]:
         """The symmetries of two shapes, each transferred from the other where only one has its own."""
-        known_x = None if symmetry_source is None else given_symmetry(x, symmetry_source)
+        if not isinstance(symmetry, str):
+            symmetry = torch.as_tensor(symmetry)
+        elif symmetry == "none":
+            if symmetry_source is not None:
+                raise ValueError("symmetry='none' asks for no symmetry at all, but symmetry_source was given")
+            return no_symmetry(x), no_symmetry(y)
+        known_x = None if symmetry_source is None else given_symmetry(x, torch.as_tensor(symmetry_source))
         if isinstance(symmetry, Tensor):
             known_y = given_symmetry(y, symmetry)
-        elif symmetry == "none":
-            return no_symmetry(x), no_symmetry(y)
         elif symmetry == "extrinsic":
             known_y = self.symmetry(y)
         else:
@@ -358,10 +380,3 @@ def _spectrum_warning(shape: PreparedShape, k: int, rtol: float = 1e-3, most: fl
 def _label(agreement: float) -> str:
     """Name of a map by its orientation agreement; a map that is right on three quarters of the area has 0.5."""
     return "direct" if agreement > 0.3 else "mirrored" if agreement < -0.3 else "unknown"
-
-
-def _as_mesh(mesh: Mesh | str | Path) -> Mesh:
-    """Load a file, or take a mesh as it is, and refuse what cannot be matched."""
-    loaded = mesh if isinstance(mesh, Mesh) else load_mesh(mesh)
-    check_mesh(loaded)
-    return loaded
