@@ -119,11 +119,12 @@ def read_mesh(path: Path, seen: dict[Path, "Mesh"]) -> "Mesh":
 def shape_faults() -> Iterator[None]:
     """Faults of a shape become errors for the user; every other exception is a bug and keeps its traceback."""
     from torchqm.geometry import MeshError
+    from torchqm.matching import MatchError
     from torchqm.spectral import SpectrumError
 
     try:
         yield
-    except (MeshError, SpectrumError) as error:
+    except (MatchError, MeshError, SpectrumError) as error:
         raise UserError(str(error)) from error
 
 

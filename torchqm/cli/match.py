@@ -77,7 +77,7 @@ def add_parser(commands: Any) -> None:
         "--method",
         choices=METHODS,
         default="quotient",
-        help="quotient (default): what measured best; paper: sections 4 to 7 as printed; semi: section 5 alone",
+        help="quotient (default): what measured best; paper: sections 4 to 7, its parameters; semi: section 5 alone",
     )
     parser.add_argument("--no-picture", action="store_true", help="do not draw match.png")
     add_threads(parser)

@@ -59,7 +59,7 @@ def add_parser(commands: Any) -> None:
         "--method",
         choices=("quotient", "paper"),
         default="quotient",
-        help="way of transfer. quotient (default): what measured best; paper: section 6.1 as printed",
+        help="way of transfer. quotient (default): what measured best; paper: section 6.1",
     )
     parser.add_argument("--no-picture", action="store_true", help="do not draw symmetry.png")
     add_threads(parser)

@@ -2,7 +2,7 @@
 
 from torchqm.matching.known import KnownSymmetry, extrinsic_symmetry, given_symmetry, no_symmetry, transferred_symmetry
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
-from torchqm.matching.parameters import MatchParameters
+from torchqm.matching.parameters import MatchError, MatchParameters
 from torchqm.matching.pipeline import METHODS, Collection, find_symmetry, match, match_prepared
 from torchqm.matching.quotient import QuotientMatch, choose_halves, match_quotient, refine_by_icp, refine_by_odd_block
 from torchqm.matching.result import MatchResult, SymmetryResult
@@ -14,6 +14,7 @@ __all__ = [
     "METHODS",
     "Collection",
     "KnownSymmetry",
+    "MatchError",
     "MatchParameters",
     "MatchResult",
     "OddMap",

@@ -1,13 +1,14 @@
 """Where a shape's symmetry comes from: its mirror plane, the user, or a reference shape."""
 
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from torchqm.matching.parameters import MatchParameters
+from torchqm.matching.parameters import MatchError, MatchParameters
 from torchqm.matching.shape import PreparedShape
 from torchqm.matching.transfer import transfer_symmetry
 from torchqm.symmetry.extrinsic import find_reflection
@@ -83,6 +84,11 @@ def extrinsic_symmetry(shape: PreparedShape, max_residual: float = 0.02) -> Know
             SymmetryGroup.trivial(shape.n_verts), torch.zeros_like(shape.basis.mass), "none", [text], details
         )
     warnings = []
+    if found.others:
+        warnings.append(
+            f"{name}: {found.others} more mirror plane(s) fit as well; only one reflection is used, "
+            "and on the other shape it may be another"
+        )
     if not found.convincing:
         warnings.append(f"{name}: the mirror plane fits only roughly ({numbers})")
     # Not the sign of the side alone: on the axis that is rounding, and would differ with the units of the file.
@@ -90,27 +96,27 @@ def extrinsic_symmetry(shape: PreparedShape, max_residual: float = 0.02) -> Know
     return KnownSymmetry(SymmetryGroup.from_reflection(found.map), sign, "extrinsic", warnings, details)
 
 
-def given_symmetry(shape: PreparedShape, maps: Int[Tensor, "G V"], origin: str = "file") -> KnownSymmetry:
+def given_symmetry(shape: PreparedShape, maps: Tensor, origin: str = "file") -> KnownSymmetry:
     """A symmetry handed in as a table of vertex maps, row 0 the identity; left and right are found by clustering.
 
     Raises:
-        ValueError: wrong length or ids, row 0 is not the identity, more than one reflection, or a map that is not an
+        MatchError: wrong length or ids, row 0 is not the identity, more than one reflection, or a map that is not an
             involution: applied twice, it must bring each point back to within a tenth of sqrt(area) on average.
     """
     if maps.ndim != 2 or maps.dtype != torch.int64:
-        raise ValueError(
+        raise MatchError(
             f"the symmetry of {shape.mesh.label} must be a (G, V) table of int64 vertex ids, row 0 the identity; "
             f"got {maps.dtype} of shape {tuple(maps.shape)}"
         )
     if maps.shape[1] != shape.n_verts:
-        raise ValueError(
+        raise MatchError(
             f"the symmetry has {maps.shape[1]} entries a row, but {shape.mesh.label} has {shape.n_verts} vertices"
         )
     group = SymmetryGroup(maps)
     if group.order == 1:
         return KnownSymmetry(group, torch.zeros_like(shape.basis.mass), origin)
     if group.order > 2:
-        raise ValueError(
+        raise MatchError(
             f"{shape.mesh.label}: the symmetry has {group.order} elements; dense maps are extracted for one reflection "
             "(2 elements) so far"
         )
@@ -118,7 +124,7 @@ def given_symmetry(shape: PreparedShape, maps: Int[Tensor, "G V"], origin: str =
     back = group.maps[1][group.maps[1]]
     error = float(((verts - verts[back]).norm(dim=1) * shape.basis.mass).sum())
     if error > 0.1:
-        raise ValueError(
+        raise MatchError(
             f"{shape.mesh.label}: row 1 of the symmetry is no reflection: applied twice it moves points by {error:.3f} "
             "sqrt(area) on average (0 is exact, 0.1 is allowed)"
         )
@@ -141,7 +147,7 @@ def transferred_symmetry(
     if moved.halves is not None:
         details |= {
             "persistence": list(moved.halves.persistence[:4]),
-            "margin": moved.halves.margin,
+            "margin": moved.halves.margin if isfinite(moved.halves.margin) else None,
             "balance": moved.halves.balance,
         }
     warnings = [f"{shape.mesh.label}: {text}" for text in moved.warnings]

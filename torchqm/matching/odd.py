@@ -9,6 +9,7 @@ from torchqm.fmap.refine import nearest_isometry
 from torchqm.fmap.solve import solve_fmap
 from torchqm.geometry.mesh import Mesh
 from torchqm.matching.initial import unit_columns_pair
+from torchqm.matching.parameters import MatchError
 from torchqm.spectral.basis import SpectralBasis
 from torchqm.symmetry.basis import SymmetrizedBasis
 from torchqm.symmetry.orientation import function_pairs, orientation_coefficients
@@ -65,18 +66,23 @@ def solve_odd(
         commutativity: weight per (descriptor / basis function).
 
     Raises:
-        ValueError: fewer than three even functions, so there are no pairs.
+        MatchError: fewer than three even functions, so there are no pairs, or no odd functions on one of the shapes.
     """
     n = min(n_functions, fmap_even.shape[1])
-    if n < 3:
-        raise ValueError(f"n_functions={n}: at least 3 even functions are needed to make a pair of non-constant ones")
+    if n < 3 or not odd_x.k or not odd_y.k:
+        raise MatchError(
+            f"{fmap_even.shape[1]} even and {odd_x.k} and {odd_y.k} odd functions: at least 3 even ones are needed to "
+            "make a pair of non-constant ones, and an odd one on each shape; take a larger k"
+        )
     pairs = function_pairs(n)
     images = even_y.evecs[:, : fmap_even.shape[0]] @ fmap_even[:, :n]
     f, g = unit_columns_pair(
         orientation_coefficients(mesh_x, even_x.evecs[:, :n], pairs, odd_x.evecs),
         orientation_coefficients(mesh_y, images, pairs, odd_y.evecs),
     )
-    fmap = nearest_isometry(solve_fmap(f, g, odd_x.evals, odd_y.evals, commutativity * f.shape[1] / odd_x.k))
+    fmap = nearest_isometry(
+        solve_fmap(f, g, odd_x.evals, odd_y.evals, commutativity * f.shape[1] / odd_x.k, ridge=1e-9)
+    )
     scale = g.norm().clamp_min(1e-300)
     return OddMap(fmap, float((fmap @ f - g).norm() / scale), float((fmap @ f + g).norm() / scale))
 

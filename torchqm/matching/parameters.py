@@ -2,7 +2,11 @@
 
 from dataclasses import asdict, dataclass, replace
 
-__all__ = ["MatchParameters"]
+__all__ = ["MatchError", "MatchParameters"]
+
+
+class MatchError(ValueError):
+    """These shapes, symmetries and parameters do not fit each other; the message says what does not, with numbers."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,8 @@ class MatchParameters:
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}={getattr(self, name)}: must not be negative")
 
+        if self.descriptor == "wks" and self.n_descriptors < 2:
+            raise ValueError(f"n_descriptors={self.n_descriptors}: the wave kernel signature needs at least 2 energies")
         if self.semi_width is not None and self.semi_width <= 0:
             raise ValueError(f"semi_width={self.semi_width}: must be positive, or None for the iteration as printed")
         if self.growth <= 1:

@@ -15,7 +15,15 @@ from torchqm.matching.shape import PreparedShape
 from torchqm.symmetry.basis import SymmetrizedBasis, symmetrized_basis
 from torchqm.symmetry.group import SymmetryGroup
 
-__all__ = ["QuotientMatch", "choose_halves", "dense_map", "match_quotient", "refine_by_icp", "refine_by_odd_block"]
+__all__ = [
+    "QuotientMatch",
+    "choose_halves",
+    "dense_map",
+    "match_quotient",
+    "refine_by_icp",
+    "refine_by_odd_block",
+    "refine_fmap",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,20 +107,17 @@ def choose_halves(
 def refine_by_icp(
     p2p_xy: Int[Tensor, " Vx"], x: PreparedShape, y: PreparedShape, parameters: MatchParameters
 ) -> Float[Tensor, "K K"]:
-    """The paper's last step: the point map as a functional map at k = 100, ICP there (5 steps) and at 300 (3 steps).
+    """The paper's last step: the point map as a functional map at k = 100, ICP there (5 steps) and at ``k_max`` (3).
 
     Smaller bases are used as far as ``k_max`` allows.
 
     References:
         Paper, section 7.4; Ovsjanikov et al. 2012, section 8.1.
     """
+    k = min(100, parameters.k_max, x.basis.k, y.basis.k)
     samples = x.samples[: parameters.n_samples]
-    k_max = min(parameters.k_max, x.basis.k, y.basis.k)
-    k = min(100, k_max)
     fmap = correspondence_fmap(p2p_xy, x.basis.truncate(k), y.basis.truncate(k), samples)
-    among = y.basis.restricted(y.anchors)
-    fmap = upsample(fmap, x.basis, among, samples, [k], steps=5)
-    return upsample(fmap, x.basis, among, samples, [k_max], steps=3) if k_max > k else fmap
+    return _icp_at_100_and(fmap, x, y, parameters)
 
 
 def refine_by_odd_block(
@@ -133,18 +138,35 @@ def refine_by_odd_block(
         x.mesh, y.mesh, match.source.even, match.target.even, match.fmap, match.source.odd, match.target.odd
     )
     fmap = join_blocks(match.source, match.target, match.fmap, odd.fmap)
-    return upsample_to(fmap, x, y, parameters), odd
+    return refine_fmap(fmap, x, y, parameters), odd
 
 
-def upsample_to(
+def refine_fmap(
     fmap: Float[Tensor, "K0 K0"], x: PreparedShape, y: PreparedShape, parameters: MatchParameters
 ) -> Float[Tensor, "K K"]:
-    """Spectral upsampling from where a map stands to ``k_max``; nothing where ``refinement`` is ``none``."""
+    """The last refinement of a full map, by the way that ``parameters.refinement`` names, up to ``k_max`` functions.
+
+    ``none`` leaves the map as it is, ``icp`` iterates at k = 100 and at ``k_max`` (section 7.4), ``upsample`` grows the
+    basis step by step.
+    """
     k_max = min(parameters.k_max, x.basis.k, y.basis.k)
     if parameters.refinement == "none" or k_max <= fmap.shape[0]:
         return fmap
+    if parameters.refinement == "icp":
+        return _icp_at_100_and(fmap, x, y, parameters)
     sizes = growing_sizes(fmap.shape[0], k_max, parameters.growth)
     return upsample(fmap, x.basis, y.basis.restricted(y.anchors), x.samples[: parameters.n_samples], sizes)
+
+
+def _icp_at_100_and(
+    fmap: Float[Tensor, "K0 K0"], x: PreparedShape, y: PreparedShape, parameters: MatchParameters
+) -> Float[Tensor, "K K"]:
+    """Five steps at 100 functions, then three at ``k_max``; one stage only where ``k_max`` is no larger than 100."""
+    samples, among = x.samples[: parameters.n_samples], y.basis.restricted(y.anchors)
+    k_max = min(parameters.k_max, x.basis.k, y.basis.k)
+    k = min(100, k_max)
+    fmap = upsample(fmap, x.basis, among, samples, [k], steps=5)
+    return upsample(fmap, x.basis, among, samples, [k_max], steps=3) if k_max > k else fmap
 
 
 def dense_map(fmap: Float[Tensor, "Ky Kx"], x: PreparedShape, y: PreparedShape) -> Int[Tensor, " Vx"]:

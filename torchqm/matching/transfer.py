@@ -12,7 +12,7 @@ from torchqm.fmap.solve import solve_fmap
 from torchqm.matching.initial import basis_size, shared_descriptors, unit_columns_pair
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
 from torchqm.matching.parameters import MatchParameters
-from torchqm.matching.quotient import dense_map
+from torchqm.matching.quotient import dense_map, refine_fmap
 from torchqm.matching.semi_quotient import SemiQuotientMatch, match_semi_quotient, pull_back, sharpen_orbit_map
 from torchqm.matching.shape import PreparedShape
 from torchqm.symmetry.group import SymmetryGroup
@@ -187,7 +187,7 @@ def self_map_from_halves(
     (values,) = shared_descriptors([x.basis], parameters)
     even, odd = basis.coefficients(values), basis.coefficients(sign[:, None] * values)
     f, g = unit_columns_pair(torch.cat([even, odd], 1), torch.cat([even, -odd], 1))
-    fmap = solve_fmap(f, g, basis.evals, basis.evals, parameters.self_commutativity * f.shape[1] / basis.k)
+    fmap = solve_fmap(f, g, basis.evals, basis.evals, parameters.self_commutativity * f.shape[1] / basis.k, ridge=1e-9)
     samples = x.samples[: parameters.n_samples]
     among = basis.restricted(x.anchors)
     fmap = quotient_icp(fmap, basis, among, samples, parameters.icp_steps, parameters.time)
@@ -216,8 +216,7 @@ def refine_self_map(
         return fmap
     samples, among = x.samples[: parameters.n_samples], x.basis.restricted(x.anchors)
     if parameters.refinement == "icp":
-        fmap = upsample(fmap, x.basis, among, samples, [k for k in (100,) if k < k_max], steps=5)
-        return upsample(fmap, x.basis, among, samples, [k_max], steps=3)
+        return refine_fmap(fmap, x, x, parameters)
     for size in growing_sizes(fmap.shape[0], k_max, parameters.growth):
         # Without the projection the self-map drifts towards the identity, the best map of a shape to itself.
         fmap = nearest_involution(upsample(fmap, x.basis, among, samples, [size]))

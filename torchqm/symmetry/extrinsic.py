@@ -26,6 +26,7 @@ class ExtrinsicReflection:
         map: ``(V,)`` for each vertex the vertex nearest to its mirror image.
         residual: root mean square distance (by area) from mirrored vertices to the surface's vertices / sqrt(area).
         residual_max: the largest such distance / sqrt(area).
+        others: how many planes of a clearly different direction (30 degrees or more) fit nearly as well.
         spacing: root mean square distance from a vertex to its nearest neighbour / sqrt(area): the residual cannot be
             expected below it where the triangulation is not symmetric.
     """
@@ -36,6 +37,7 @@ class ExtrinsicReflection:
     residual: float
     residual_max: float
     spacing: float
+    others: int = 0
 
     def side(self, verts: Float[Tensor, "V 3"]) -> Float[Tensor, " V"]:
         """Signed distance of points from the plane."""
@@ -89,19 +91,26 @@ def find_reflection(mesh: Mesh, n_samples: int = 500, n_refine: int = 3, seed: i
     order = np.argsort([_rms(coarse, few, normal, offset) for normal, offset in candidates], kind="stable")
     best = [candidates[i] for i in order[:n_refine].tolist()]
     refined = [_reflective_icp(tree, many, normal, offset, steps=30) for normal, offset in best]
-    normal, offset = min(refined, key=lambda c: _rms(tree, many, c[0], c[1]))
+    fits = [_rms(tree, many, normal, offset) for normal, offset in refined]
+    normal, offset = refined[int(np.argmin(fits))]
+    spacing = float(np.sqrt((np.asarray(tree.query(many, k=2)[0])[:, 1] ** 2).mean()))
+    rivals = [p for p, fit in zip(refined, fits, strict=True) if fit**2 <= min(fits) ** 2 + (spacing / 2) ** 2]
+    others: list[np.ndarray] = []
+    for rival, _ in rivals:
+        if all(abs(rival @ known) < np.cos(np.pi / 6) for known in [normal, *others]):
+            others.append(rival)
     if normal[np.argmax(np.abs(normal))] < 0:
         normal, offset = -normal, -offset
 
     distance, partner = _nearest(tree, _mirror(verts, normal, offset))
-    spacing = np.asarray(tree.query(many, k=2)[0])[:, 1]
     return ExtrinsicReflection(
         normal=torch.from_numpy(normal.copy()),
         offset=float((offset + normal @ centre) * scale),
         map=torch.from_numpy(used[partner]),
         residual=float(np.sqrt(weights @ distance**2)),
         residual_max=float(distance[used].max()),
-        spacing=float(np.sqrt((spacing**2).mean())),
+        spacing=spacing,
+        others=len(others),
     )
 
 
