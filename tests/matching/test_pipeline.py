@@ -25,6 +25,7 @@ from torchqm.matching import (
     MatchParameters,
     extrinsic_symmetry,
     find_symmetry,
+    given_symmetry,
     match,
     match_prepared,
     no_symmetry,
@@ -539,3 +540,26 @@ def test_a_file_is_read_and_prepared_once(tmp_path):
     save_mesh(creature("quadruped", 600).mesh, path)
     collection = Collection(path, parameters=MatchParameters(k=20, k_max=30))
     assert collection.shape(str(path)) is collection.shape(path)
+
+
+@pytest.mark.parametrize("method", ["quotient", "paper"])
+def test_every_refinement_is_carried_out(pair, method):
+    source, target = (prepare(creature.mesh, 60, 600) for creature in pair[:2])
+    known = [given_symmetry(s, c.base_group) for s, c in zip((source, target), pair, strict=False)]
+    maps = {}
+    for refinement in ("none", "icp", "upsample"):
+        parameters = FAST.changed(refinement=refinement, k_max=60)
+        maps[refinement] = match_prepared(source, target, *known, method, parameters)
+    assert maps["none"].fmaps.shape[1] < 60
+    assert maps["icp"].fmaps.shape[1] == maps["upsample"].fmaps.shape[1] == 60
+    assert not torch.equal(maps["icp"].fmaps, maps["upsample"].fmaps)
+
+
+def test_several_mirror_planes_and_poor_maps_are_told():
+    """An ellipsoid-like body has three planes: which of them is found on either shape is chance."""
+    body = creature("ellipsoid", 800)
+    small = MatchParameters(k=20, k_max=30, n_descriptors=20, n_samples=300, icp_steps=2)
+    known = extrinsic_symmetry(prepare(body.mesh, 30))
+    assert any("2 more mirror plane(s) fit as well" in text for text in known.warnings)
+    other = match(creature("octopus", 800, pose=1).mesh, creature("quadruped", 800).mesh, parameters=small)
+    assert any("no map is near an isometry" in text for text in other.warnings)

@@ -13,7 +13,7 @@ from torchqm.matching import (
     refine_by_icp,
     refine_by_odd_block,
 )
-from torchqm.matching.quotient import dense_map, upsample_to
+from torchqm.matching.quotient import dense_map, refine_fmap
 from torchqm.symmetry import SymmetryGroup
 from torchqm.testing import assert_orbit_equal
 
@@ -119,10 +119,10 @@ def test_odd_block_and_upsampling_give_the_direct_map(either):
 
 def test_upsampling_ends_at_k_max(exact):
     start = truth(exact, 30) + 0.03 * noise(30, 30)
-    torch.testing.assert_close(upsample_to(start, exact.x, exact.y, FAST), truth(exact), atol=1e-6, rtol=0)
-    assert upsample_to(start, exact.x, exact.y, FAST.changed(k_max=1000)).shape == (K, K)  # what the bases have
-    assert upsample_to(start, exact.x, exact.y, FAST.changed(k_max=30)) is start
-    assert upsample_to(start, exact.x, exact.y, FAST.changed(refinement="none")) is start
+    torch.testing.assert_close(refine_fmap(start, exact.x, exact.y, FAST), truth(exact), atol=1e-6, rtol=0)
+    assert refine_fmap(start, exact.x, exact.y, FAST.changed(k_max=1000)).shape == (K, K)  # what the bases have
+    assert refine_fmap(start, exact.x, exact.y, FAST.changed(k_max=30)) is start
+    assert refine_fmap(start, exact.x, exact.y, FAST.changed(refinement="none")) is start
 
 
 def test_dense_maps_take_any_size_and_no_loose_vertex(exact):

@@ -69,11 +69,12 @@ def solve_odd(
         MatchError: fewer than three even functions, so there are no pairs, or no odd functions on one of the shapes.
     """
     n = min(n_functions, fmap_even.shape[1])
-    if n < 3 or not odd_x.k or not odd_y.k:
+    if n < 3:
         raise MatchError(
-            f"{fmap_even.shape[1]} even and {odd_x.k} and {odd_y.k} odd functions: at least 3 even ones are needed to "
-            "make a pair of non-constant ones, and an odd one on each shape; take a larger k"
+            f"n_functions={n}: at least 3 even functions are needed to make a pair of non-constant ones; take a larger k"
         )
+    if not odd_x.k or not odd_y.k:
+        raise MatchError(f"{odd_x.k} and {odd_y.k} odd functions: none can be matched; take a larger k")
     pairs = function_pairs(n)
     images = even_y.evecs[:, : fmap_even.shape[0]] @ fmap_even[:, :n]
     f, g = unit_columns_pair(
