@@ -38,7 +38,7 @@ from torchqm.matching.steps import StepListener, Steps
 __all__ = ["METHODS", "Collection", "find_symmetry", "match", "match_prepared"]
 
 POOR_SCORE = 0.15
-"""Commutativity score above which a map is called poor: good pairs of the built-in creatures have 0.03 to 0.06."""
+"""Commutativity score above which a map is called poor; true maps of TOSCA have 0.03 (wolf) to 0.13 (cat)."""
 
 METHODS = ("quotient", "paper", "semi")
 
