@@ -71,7 +71,8 @@ def solve_odd(
     n = min(n_functions, fmap_even.shape[1])
     if n < 3:
         raise MatchError(
-            f"n_functions={n}: at least 3 even functions are needed to make a pair of non-constant ones; take a larger k"
+            f"n_functions={n}: at least 3 even functions are needed to make a pair of non-constant ones; "
+            "take a larger k"
         )
     if not odd_x.k or not odd_y.k:
         raise MatchError(f"{odd_x.k} and {odd_y.k} odd functions: none can be matched; take a larger k")
