@@ -2,8 +2,8 @@
 
     python benchmarks/speed_pair.py [--scb ROOT] [--cache DIR] [--n-verts 28000] [--repeats 3]
 
-With --scb the pair is cat1 -> cat0 of TOSCA (27,894 vertices each), else two built-in quadrupeds. The source's symmetry
-is not known: a mirror plane is looked for in both, and the source's symmetry is transferred from the target. The peer is
+With --scb the pair is cat1 -> cat0 of TOSCA (27,894 vertices each), else two built-in quadrupeds. Their symmetry
+is not known: a mirror plane is looked for in both, and the source's symmetry is transferred. The peer is
 the same match with exhaustive searches over all vertices of the target, in the same run. Writes
 benchmarks/results/speed_pair.json.
 """

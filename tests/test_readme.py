@@ -2,6 +2,8 @@
 
 import doctest
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -79,3 +81,9 @@ def test_table_of_keys_is_what_is_written():
 def test_results_have_a_place():
     assert README.count("<!-- results:begin -->") == README.count("<!-- results:end -->") == 1
     assert README.index("<!-- results:begin -->") < README.index("<!-- results:end -->")
+
+
+def test_results_are_those_of_the_json_files():
+    script = ROOT / "benchmarks" / "readme_tables.py"
+    done = subprocess.run([sys.executable, str(script), "--check"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr

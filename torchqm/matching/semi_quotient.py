@@ -1,11 +1,13 @@
 """Semi-quotient matching: the symmetry is known on the target only (paper, section 5)."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.fmap.convert import fmap_to_p2p
+from torchqm.fmap.nearest import SurfaceSearch
 from torchqm.fmap.refine import growing_sizes, nearest_isometry, semi_quotient_icp, semi_upsample
 from torchqm.matching.initial import basis_size, initial_fmap, shared_descriptors
 from torchqm.matching.parameters import MatchParameters
@@ -25,15 +27,24 @@ class SemiQuotientMatch:
         target: the target's basis split by its known symmetry.
         source: the source's basis split by what the map says: L2+ of the source is the complement of the kernel of R.
         even: ``(K+_y, K+_x)``, R restricted to that L2+: a square isometry.
-        orbit_map: ``(V_source,)`` for each source vertex a target vertex; its *orbit* is the image. Which point of the
-            orbit stands here is arbitrary and may differ between neighbours.
+        time: diffusion time of the deltas.
+        search: how dense maps onto the target are searched for.
     """
 
     fmap: Float[Tensor, "Key Kx"]
     target: SymmetrizedBasis
     source: SymmetrizedBasis
     even: Float[Tensor, "Key Kex"]
-    orbit_map: Int[Tensor, " Vx"]
+    time: float = 0.0
+    search: SurfaceSearch | None = None
+
+    @cached_property
+    def orbit_map(self) -> Int[Tensor, " Vx"]:
+        """For each source vertex a target vertex whose *orbit* is the image (paper, sections 4.4 and 5).
+
+        Which point of the orbit stands here is arbitrary and may differ between neighbours.
+        """
+        return fmap_to_p2p(self.fmap, self.source.full, self.target.even, self.time, self.search)
 
 
 def match_semi_quotient(
@@ -64,8 +75,7 @@ def match_semi_quotient(
     )
     fmap = nearest_isometry(fmap)
     source = split_by_projector(basis_x, fmap.T @ fmap)
-    orbit_map = fmap_to_p2p(fmap, basis_x, target.even, parameters.time, y.search)
-    return SemiQuotientMatch(fmap, target, source, fmap @ source.even_coeffs, orbit_map)
+    return SemiQuotientMatch(fmap, target, source, fmap @ source.even_coeffs, parameters.time, y.search)
 
 
 def sharpen_orbit_map(
