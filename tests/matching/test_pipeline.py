@@ -563,3 +563,14 @@ def test_several_mirror_planes_and_poor_maps_are_told():
     assert any("2 more mirror plane(s) fit as well" in text for text in known.warnings)
     other = match(creature("octopus", 800, pose=1).mesh, creature("quadruped", 800).mesh, parameters=small)
     assert any("no map is near an isometry" in text for text in other.warnings)
+
+
+def test_seconds_are_those_of_this_match(pair):
+    small = MatchParameters(k=20, k_max=30, n_descriptors=20, n_samples=300, icp_steps=2)
+    collection = Collection(parameters=small)
+    first = collection.match(pair[0].mesh, pair[1].mesh).seconds
+    again = collection.match(pair[0].mesh, pair[1].mesh).seconds
+    assert sum("eigenpairs" in name for name in first) == 2
+    assert not any("eigenpairs" in name for name in again)
+    assert 0 < again["quotient matching"] < first["quotient matching"] + again["quotient matching"]
+    assert all(spent > 0 for spent in (*first.values(), *again.values()))

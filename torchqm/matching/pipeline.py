@@ -1,5 +1,6 @@
 """From two meshes to all the equally good dense maps, and the same for a collection of poses (paper, section 6.2)."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -209,13 +210,15 @@ class Collection:
         symmetry_source: Tensor | np.ndarray | None = None,
     ) -> MatchResult:
         """Match two poses; arguments and result as in :func:`match`."""
+        earlier = dict(self.steps.seconds)
         meshes = [m if isinstance(m, PreparedShape) else self.load(m) for m in (source, target)]
         self.steps.total = self.steps.done + self.expected_work(
             *meshes, symmetries=not isinstance(symmetry, str) or symmetry != "none"
         )
         x, y = (self.shape(m) for m in meshes)
         known_x, known_y = self._both(x, y, symmetry, symmetry_source)
-        return match_prepared(x, y, known_x, known_y, self.method, self.parameters, self.steps)
+        result = match_prepared(x, y, known_x, known_y, self.method, self.parameters, self.steps)
+        return replace(result, seconds=self.steps.since(earlier))
 
     def _both(
         self,
@@ -365,7 +368,7 @@ def match_prepared(
         method=method,
         warnings=warnings,
         parameters=parameters.as_dict(),
-        seconds={name: spent - earlier.get(name, 0.0) for name, spent in steps.seconds.items()},
+        seconds=steps.since(earlier),
         details=details,
     )
 

@@ -38,6 +38,11 @@ class Steps:
         """Part of the expected work that is done."""
         return min(self.done / self.total, 1.0) if self.total > 0 else 0.0
 
+    def since(self, earlier: dict[str, float]) -> dict[str, float]:
+        """Seconds of the steps that were timed after ``earlier``, a copy of :attr:`seconds` made before."""
+        spent = {name: total - earlier.get(name, 0.0) for name, total in self.seconds.items()}
+        return {name: seconds for name, seconds in spent.items() if seconds > 0}
+
     @contextmanager
     def __call__(self, name: str, cost: float = 0.0) -> Iterator[None]:
         """Time the body of a ``with`` statement under a name."""
