@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchqm.matching.parameters import MatchError, MatchParameters
 from torchqm.matching.shape import PreparedShape
+from torchqm.matching.symmetry_file import MAX_RETURN_ERROR
 from torchqm.matching.transfer import transfer_symmetry
 from torchqm.symmetry.extrinsic import find_reflection
 from torchqm.symmetry.group import SymmetryGroup
@@ -123,10 +124,10 @@ def given_symmetry(shape: PreparedShape, maps: Tensor, origin: str = "file") -> 
     verts = shape.mesh.verts
     back = group.maps[1][group.maps[1]]
     error = float(((verts - verts[back]).norm(dim=1) * shape.basis.mass).sum())
-    if error > 0.1:
+    if error > MAX_RETURN_ERROR:
         raise MatchError(
             f"{shape.mesh.label}: row 1 of the symmetry is no reflection: applied twice it moves points by {error:.3f} "
-            "sqrt(area) on average (0 is exact, 0.1 is allowed)"
+            f"sqrt(area) on average (0 is exact, {MAX_RETURN_ERROR:g} is allowed)"
         )
     halves = persistence_clusters(shape.mesh, displacement(shape.mesh, group.maps[1], "extrinsic"))
     warnings = [f"{shape.mesh.label}: {halves.warning}"] if halves.warning else []
