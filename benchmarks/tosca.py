@@ -44,8 +44,9 @@ from torchqm.matching import (
     prepare,
 )
 from torchqm.matching.known import KnownSymmetry
+from torchqm.matching.self_map import self_map_from_halves
 from torchqm.matching.semi_quotient import sharpen_orbit_map
-from torchqm.matching.transfer import self_map_from_halves, transfer_symmetry
+from torchqm.matching.transfer import transfer_symmetry
 from torchqm.symmetry import SymmetryGroup, find_reflection
 
 SEMI = "semi-quotient, k=30"

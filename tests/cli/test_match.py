@@ -125,6 +125,12 @@ BAD_MESHES = {
     "nan": (CUBE.replace("0 0 1", "0 nan 1"), ["NaN or infinite", "vertex 3"]),
     "no faces": ("OFF\n4 0 0\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n", ["no faces"]),
     "few vertices": (CUBE, ["4 vertices are fewer than the 30 eigenfunctions", "--k 30"]),
+    "small": (
+        CUBE.replace("1 0 0", "1e-100 0 0").replace("0 1 0", "0 1e-100 0").replace("0 0 1", "0 0 1e-100"),
+        ["too small", "1e-100", "rescale"],
+    ),
+    "large": (CUBE.replace("0 0 0", "0 0 -1e308").replace("0 0 1", "0 0 1e308"), ["too large", "1.8e+308", "rescale"]),
+    "lines": (CUBE + "3 0 1 2\n", ["declares 4 vertices and 4 faces", "8 lines", "9 follow", "line 11"]),
     "no area": (CUBE.replace("1 0 0", "0 0 0").replace("0 1 0", "0 0 0").replace("0 0 1", "0 0 0"), ["no area"]),
 }
 
@@ -146,11 +152,12 @@ def test_bad_meshes(pair, tmp_path, capsys, fault, which):
 
 
 def test_several_components_are_counted_with_their_areas(pair, tmp_path, capsys):
-    verts, faces = shapes.icosphere(2).numpy()
+    ball = shapes.icosphere(2)
+    verts, faces = ball.numpy()
     two = Mesh.from_arrays(np.concatenate([verts, 3 + verts / 3]), np.concatenate([faces, faces + len(verts)]))
     save_mesh(two, tmp_path / "two.off")
     argv = ["match", str(tmp_path / "two.off"), str(pair[0] / "x.off"), "--out", str(tmp_path / "out")]
-    fails(capsys, argv, "two.off", "2 components", "90%", "10%")
+    fails(capsys, argv, "two.off", "2 components", f"areas {ball.area:.3g}, {ball.area / 9:.3g} in", "90%", "10%")
     assert not (tmp_path / "out").exists()
 
 

@@ -40,6 +40,21 @@ def test_own_mirror_plane_and_the_file_goes_into_match(files, tmp_path, capsys):
     assert np.load(tmp_path / "match" / "match.npz")["labels"].tolist() == ["direct", "mirrored"]
 
 
+@pytest.mark.parametrize("scale", [1e-50, 1e50])
+def test_the_unit_of_length_does_not_matter(tmp_path, scale):
+    """From the file through every check to the result, also where the symmetry is read back."""
+    x = shapes.blob(2)
+    path, found = tmp_path / "x.off", tmp_path / "found"
+    save_mesh(x.mesh.moved(x.mesh.verts * scale), path)
+    assert main(["symmetry", str(path), "--out", str(found), "--no-picture", *FAST]) == 0
+    assert np.load(found / "symmetry.npz")["maps"].tolist() == x.group.maps.tolist()
+    summary = json.loads((found / "summary.json").read_text())
+    assert summary["warnings"] == []
+    argv = ["match", str(path), str(path), "--symmetry", str(found / "symmetry.npz"), "--no-picture", *FAST]
+    assert main([*argv, "--out", str(tmp_path / "match")]) == 0
+    assert np.load(tmp_path / "match" / "match.npz")["maps"].tolist() == x.group.maps.tolist()
+
+
 def test_transfer_from_a_reference(files, tmp_path):
     out = tmp_path / "out"
     argv = ["symmetry", str(files / "posed.off"), "--reference", str(files / "rest.off"), "--out", str(out)]

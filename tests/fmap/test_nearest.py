@@ -112,24 +112,38 @@ class TestSurfaceSearch:
         assert float((found == wanted).double().mean()) > 0.99
         assert float((search.nearest(points, points) == torch.arange(642)).double().mean()) > 0.99
 
-    def test_the_best_of_what_is_around_the_nearest_anchors(self, problem):
+    def test_the_best_of_what_is_around_the_nearest_anchor(self, problem):
         """Query by query; few vertices around few anchors, so that it misses, and misses the same way."""
         shape, queries, points, wanted = problem
         search = self.build(shape, 60, 8)
-        for n in (1, 3):
-            distance = torch.cdist(queries, points[search.anchors])
-            near = search.around[distance.topk(n, largest=False).indices].flatten(1)
-            best = torch.cdist(queries[:, None], points[near])[:, 0].argmin(1)
-            found = search.nearest(queries, points, n)
-            assert torch.equal(found, near[torch.arange(642), best])
-            assert not torch.equal(found, wanted)
+        near = search.around[torch.cdist(queries, points[search.anchors]).argmin(1)]
+        best = torch.cdist(queries[:, None], points[near])[:, 0].argmin(1)
+        found = search.nearest(queries, points)
+        assert torch.equal(found, near[torch.arange(642), best])
+        assert not torch.equal(found, wanted)
 
-    def test_more_anchors_never_look_worse(self, problem):
+    def test_a_guide_offers_the_partners_of_the_anchors_close_by(self, problem):
+        """The same, query by query, with another set of anchors on the side of the queries."""
+        shape, queries, points, _ = problem
+        search = self.build(shape, 60, 8)
+        guide = SurfaceSearch.build(shape.mesh.verts, area_samples(shape.mesh, 50, 1), n=3)
+        verts, anchor_points = shape.mesh.verts, points[search.anchors]
+        for query, found in zip(range(642), search.nearest(queries, points, guide).tolist(), strict=True):
+            apart = torch.cdist(verts[query][None], verts[guide.anchors])[0]
+            close = guide.anchors[apart.topk(3, largest=False).indices]
+            partners = torch.cdist(queries[close], anchor_points).argmin(1)
+            best = partners[(queries[query] - anchor_points[partners]).norm(dim=1).argmin()]
+            near = search.around[best]
+            assert found == near[(queries[query] - points[near]).norm(dim=1).argmin()]
+
+    def test_a_guide_changes_little(self, problem):
         shape, queries, points, wanted = problem
-        search = self.build(shape, 60, 12)
-        right = [float((search.nearest(queries, points, n) == wanted).double().mean()) for n in (1, 2, 5, 60)]
-        assert right == sorted(right)
-        assert right[0] < right[-1]
+        search = self.build(shape, 200, 30)
+        found = search.nearest(queries, points, search)
+        assert float((found == wanted).double().mean()) > 0.98
+        assert not torch.equal(search.nearest(queries, points, self.build(shape, 3)), found)  # it is used
+        with pytest.raises(ValueError, match="guide: has 642 vertices, but there are 600 queries"):
+            search.nearest(queries[:600], points, search)
 
     def test_around_each_anchor(self, problem):
         shape, *_ = problem

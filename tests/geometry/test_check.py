@@ -76,13 +76,63 @@ def test_clean_faces_keeps_the_first_and_the_order():
     assert clean_faces(Mesh.from_arrays(GRID, faces)).tolist() == [[2, 3, 1], [0, 1, 2]]
 
 
-@pytest.mark.parametrize("scale", [1e-180, 1e-12, 1.0, 1e12, 1e150])
+@pytest.mark.parametrize("scale", [1e-180, 1e-50, 1e-12, 1.0, 1e12, 1e50, 1e150, 1e307])
 def test_counts_do_not_depend_on_the_scale(scale):
     needle = [[0, 0, 0], [1, 0, 0], [0.5, 1e-6, 0], [0.5, 1, 0], [0.5, 1 + 1e-9, 0]]
     mesh = Mesh.from_arrays(np.array(needle) * scale, [[0, 1, 2], [0, 2, 3], [2, 1, 3], [0, 3, 4]])
-    report = check_mesh(mesh)
+    report = inspect_mesh(mesh)
     assert (report.n_flat, report.n_components, report.n_boundary_edges) == (1, 1, 4)
     assert report.min_angle == pytest.approx(inspect_mesh(mesh.moved(mesh.verts / scale)).min_angle, rel=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-60, 1e-50, 1e50, 1e60])
+def test_areas_keep_their_digits_at_every_scale_that_is_let_through(scale):
+    mesh = sphere(3)
+    size = scale / float((mesh.verts.amax(0) - mesh.verts.amin(0)).max()) * (1 - 1e-9 if scale > 1 else 1 + 1e-9)
+    scaled = mesh.moved(mesh.verts * size)
+    report = check_mesh(scaled)
+    assert report.warnings == []
+    assert report.area / size / size == pytest.approx(mesh.area)
+    assert scaled.area / size / size == pytest.approx(mesh.area)
+    assert torch.allclose(scaled.vertex_areas / scaled.area, mesh.vertex_areas / mesh.area)
+
+
+@pytest.mark.parametrize(
+    ("scale", "fault"),
+    [
+        (5e-324, r"too small: their extent is 9\.88e-324"),
+        (1e-100, r"too small: their extent is 2e-100"),
+        (4e-61, r"too small: their extent is 8e-61"),
+        (6e60, r"too large: their extent is 1\.2e\+61"),
+        (1e100, r"too large: their extent is 2e\+100"),
+        (1.7e308, r"too large: their extent is more than 1\.8e\+308"),
+    ],
+)
+def test_other_extents_are_refused_with_the_extent_and_the_cure(scale, fault):
+    verts = np.array([[-1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) * scale
+    mesh = Mesh.from_arrays(verts, [[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3]], name="fly.off")
+    with pytest.raises(MeshError, match=f"^fly.off: the coordinates are {fault}, allowed are 1e-60 to .*rescale"):
+        check_mesh(mesh)
+
+
+def test_a_stray_vertex_does_not_hide_a_small_surface_and_is_itself_held_to_the_limit():
+    grid = np.array([*GRID, [5.0, 5, 5]])
+    small, far = grid.copy(), grid.copy()
+    small[:4] *= 1e-70
+    far[4] *= 1e70
+    with pytest.raises(MeshError, match=r"too small: their extent is 1e-70"):
+        check_mesh(Mesh.from_arrays(small, TWO))
+    with pytest.raises(MeshError, match=r"too large: their extent is 5e\+70"):
+        check_mesh(Mesh.from_arrays(far, TWO))
+
+
+def test_inspecting_never_overflows_without_a_word():
+    verts = np.array([[-1.7e308, 0, 0], [1.7e308, 0, 0], [0, 1, 0]])
+    with pytest.raises(MeshError, match="too large"):
+        inspect_mesh(Mesh.from_arrays(verts, [[0, 1, 2]]))
+    large = inspect_mesh(Mesh.from_arrays(np.array(GRID) * 1e307, TWO))
+    assert (large.area, large.relative_area) == (np.inf, pytest.approx(1))
+    assert inspect_mesh(Mesh.from_arrays(np.array(GRID) * 1e-307, TWO)).area == 0
 
 
 def test_flat_means_height_relative_to_the_longest_edge():
@@ -129,11 +179,21 @@ def test_moebius_strip_has_no_orientation():
     assert orient_faces(moebius()) is None
 
 
-def test_components_are_refused_with_their_shares():
+def test_components_are_refused_with_their_areas_and_shares():
     verts = [*GRID, [5, 0, 0], [6, 0, 0], [5, 0.5, 0]]
-    with pytest.raises(MeshError, match=r"two\.off: 2 components with 80%, 20% of the area") as error:
+    with pytest.raises(MeshError, match=r"two\.off: 2 components with areas 1, 0\.25 in .*80%, 20% of") as error:
         check_mesh(Mesh.from_arrays(verts, [*TWO, [4, 5, 6]], name="two.off"))
     assert "weld" not in str(error.value)
+
+
+def test_areas_of_components_are_in_the_units_of_the_file_and_the_first_five_are_named():
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    verts = np.concatenate([20 * corners + [30 * k, 0, 0] for k in range(6)])
+    verts[:3] /= 3  # 22.2 instead of 200
+    with pytest.raises(MeshError, match=r"6 components with areas 200, 200, 200, 200, 200, \.\.\. in squared units"):
+        check_mesh(Mesh.from_arrays(verts, np.arange(18).reshape(-1, 3)))
+    with pytest.raises(MeshError, match=r"2 components with areas 200, 22\.2 in squared units of the file \(90%, 10%"):
+        check_mesh(Mesh.from_arrays(verts[:6], [[0, 1, 2], [3, 4, 5]]))
 
 
 def test_a_seam_is_refused_with_the_cure_named():

@@ -75,6 +75,10 @@ def assert_is_the_mesh(mesh, faces=FACES):
         "NOFF\n5 2 0\n" + "".join(f"{row} 0 0 1\n" for row in ROWS.splitlines()) + "3 0 1 3\n3 1 4 3\n",
         OFF.replace("1 1 .5", "1.0e0 1E+0 5e-1"),
         "\ufeff" + OFF,
+        OFF + "\n  \n# the end\n\n",
+        OFF.replace("5 2 0", "5 2 6"),
+        OFF.replace("5 2 0", "5 2 2") + "0 1\n1 3\n",
+        OFF.replace("5 2 0", "5 2 2") + "2 0 1\n2 1 3\n# the edges\n",
     ],
 )
 def test_off_variants(tmp_path, text):
@@ -112,6 +116,8 @@ def test_obj_negative_ids_count_from_where_they_stand(tmp_path):
 
 def test_ply_text_and_binary(tmp_path):
     assert_is_the_mesh(load_mesh(write(tmp_path, "two.ply", PLY)))
+    edge = PLY.replace("end_header", "element edge 1\nproperty int vertex1\nproperty int vertex2\nend_header") + "0 1\n"
+    assert_is_the_mesh(load_mesh(write(tmp_path, "edge.ply", edge + "\n \n")))
     body = trimesh.Trimesh(VERTS, FACES, process=False).export(file_type="ply")
     assert_is_the_mesh(load_mesh(write(tmp_path, "b.ply", body)))
 
@@ -177,6 +183,23 @@ def test_vert_and_tri_from_zero(tmp_path):
             OFF[: OFF.index("3 1 4 3")],
             "truncated after line 8: expected 5 vertices and 2 faces, found 5 and 1",
         ),
+        (
+            "m.off",
+            OFF + "3 0 1 4\n\n3 0 3 4\n",
+            r"declares 5 vertices and 2 faces, so 7 lines, but 9 follow; the first too many is line 10: '3 0 1 4'",
+        ),
+        ("m.off", OFF.replace("5 2 0", "5 1 0"), "5 vertices and 1 faces, so 6 lines, but 7 follow.*line 9: '3 1 4 3'"),
+        ("m.off", OFF.replace("5 2 0", "4 2 0"), "4 vertices and 2 faces, so 6 lines, but 7 follow"),
+        ("m.off", "# one\n" + OFF + "# two\n" + OFF, "so 7 lines, but 16 follow; the first too many is line 12: 'OFF'"),
+        ("m.off", OFF.replace("5 2 0", "5 2 2") + "0 1\n", "but 8 follow.*line 10: '0 1'"),
+        ("m.off", OFF.replace("5 2 0", "5 2 1") + "3 0 1 4\n", "but 8 follow.*line 10: '3 0 1 4'"),
+        (
+            "m.ply",
+            PLY + "3 0 1 4\n\n",
+            "declares vertex 5, face 2, so 7 lines, but 8 follow; the first too many is line 17: '3 0 1 4'",
+        ),
+        ("m.ply", PLY.replace("face 2", "face 1"), "so 6 lines, but 7 follow.*line 16: '3 1 4 3'"),
+        ("m.ply", trimesh.Trimesh(VERTS, FACES).export(file_type="ply") + b"\0" * 13, "cannot be read as PLY"),
         ("t.off", OFF[:-5], r"line 9: expected face 1 of 2 .*, found '3 1'"),
         ("t.off", OFF.replace("0 1 0", "0 1"), r"line 6: expected vertex 3 of 5 \(3 numbers\), found '0 1'"),
         ("t.off", OFF.replace("9 9 9", "9 # 9 9").replace("OFF\n", "OFF\n#\n"), "line 6: expected vertex 2 of 5"),

@@ -5,6 +5,7 @@ from references.unchecked import unchecked
 
 from torchqm.data.synthetic import creature
 from torchqm.matching import extrinsic_symmetry, given_symmetry, no_symmetry, prepare, transferred_symmetry
+from torchqm.matching.known import best_fitting
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +62,23 @@ def test_a_rough_plane_is_used_and_told(lopsided):
     assert known.group.order == 2
     assert "fits only roughly" in known.warnings[0]
     assert f"rms {known.details['residual']:.4f}" in known.warnings[0]
+
+
+def test_the_plane_that_belongs_to_that_of_the_other_shape():
+    """Three planes, and on the other shape each in turn: always its counterpart is taken."""
+    x, y = (prepare(creature("ellipsoid", 1200, retriangulate=seed).mesh, 60) for seed in (1, 2))
+    known_x, known_y = extrinsic_symmetry(x), extrinsic_symmetry(y)
+    assert len(known_x.others) == len(known_y.others) == 2
+    for wanted in (known_y, *known_y.others):
+        found = best_fitting(x, y, known_x, wanted)
+        normals = [torch.tensor(known.details["normal"]) for known in (found, wanted)]
+        assert abs(float(normals[0] @ normals[1])) > 0.99
+        scores = sorted(found.details["reflections_tried"])
+        assert scores[0] < 0.01
+        assert scores[1] > 0.05
+        assert found.warnings == known_x.warnings
+    assert best_fitting(x, y, known_x, no_symmetry(y)) is known_x
+    assert best_fitting(x, y, known_y.others[0], known_y) is known_y.others[0]
 
 
 class TestGiven:

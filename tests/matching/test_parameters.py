@@ -26,7 +26,9 @@ def test_changed_is_a_checked_copy():
 def test_plain_values():
     values = MatchParameters(semi_width=None).as_dict()
     assert json.loads(json.dumps(values)) == values
-    assert MatchParameters(**values) == MatchParameters(semi_width=None)
+    assert MatchParameters.from_dict(json.loads(json.dumps(values))) == MatchParameters(semi_width=None)
+    with pytest.raises(ValueError, match="k_min: no parameter"):
+        MatchParameters.from_dict({"k_min": 3})
 
 
 @pytest.mark.parametrize(
@@ -40,7 +42,10 @@ def test_plain_values():
         ({"n_samples": 0}, "n_samples=0"),
         ({"splits": -1}, "splits=-1"),
         ({"icp_steps": -1}, "icp_steps=-1"),
+        ({"icp_tolerance": -0.1}, "icp_tolerance=-0.1"),
         ({"commutativity": -0.5}, "commutativity=-0.5"),
+        ({"self_commutativity": (1.0, -2.0)}, r"self_commutativity=\(1.0, -2.0\): one weight or more"),
+        ({"self_commutativity": ()}, "self_commutativity=.*: one weight or more"),
         ({"time": -1e-9}, "time=-1e-09"),
         ({"growth": 1.0}, "growth=1.0"),
     ],

@@ -1,6 +1,7 @@
 import json
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -108,6 +109,24 @@ def test_json_is_whole_or_not_there(tmp_path):
     with pytest.raises(ValueError, match="ircular"):
         write_json(tmp_path / "other.json", endless)
     assert os.listdir(tmp_path) == ["summary.json"]
+
+
+def test_json_has_null_for_numbers_that_are_not_finite(tmp_path):
+    content = {"a": float("nan"), "b": [float("inf"), {"c": (float("-inf"), 0.1)}], "d": np.float64("nan"), "e": "NaN"}
+    text = write_json(tmp_path / "a.json", content).read_text()
+
+    def refuse(name):
+        raise AssertionError(f"{name} is no JSON")
+
+    expected = {"a": None, "b": [None, {"c": [None, 0.1]}], "d": None, "e": "NaN"}
+    assert json.loads(text, parse_constant=refuse) == expected
+
+
+@pytest.mark.parametrize("value", [torch.ones(2), np.arange(2), np.int64(1), {1}, b"x", Path("a.off"), object()])
+def test_json_refuses_what_it_has_no_type_for(tmp_path, value):
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        write_json(tmp_path / "a.json", {"details": {"value": value}})
+    assert os.listdir(tmp_path) == []
 
 
 def test_written_files_replace_old_ones(tmp_path):

@@ -65,12 +65,25 @@ def test_nearest_vertex_map_is_accepted_with_both_numbers(tmp_path, shape, refle
     assert f"{return_error(shape.mesh, torch.from_numpy(ids)):.3f}" in read.notes[0]
 
 
-def test_return_error_is_zero_for_an_involution_at_any_scale(shape):
-    assert return_error(shape.mesh, shape.group.maps[1]) == 0
+@pytest.mark.parametrize("scale", [1e-150, 1e-50, 1, 1e3, 1e50, 1e150])
+def test_return_error_does_not_depend_on_the_scale(shape, scale):
     turned = torch.roll(torch.arange(642), 1)
-    big = shape.mesh.moved(shape.mesh.verts * 1000)
-    assert return_error(big, turned) == pytest.approx(return_error(shape.mesh, turned))
-    assert return_error(shape.mesh, turned) > 0
+    mesh = shape.mesh.moved(shape.mesh.verts * scale)
+    assert return_error(mesh, shape.group.maps[1]) == 0
+    moved = (shape.mesh.verts - shape.mesh.verts[turned[turned]]).norm(dim=1)
+    mean = float((moved * shape.mesh.vertex_areas).sum()) / shape.mesh.area
+    assert mean > 0
+    assert return_error(mesh, turned) == pytest.approx(mean / shape.mesh.area**0.5)
+
+
+def test_a_map_that_is_no_reflection_is_refused_with_its_number_at_any_scale(tmp_path, shape):
+    np.save(tmp_path / "s.npy", np.random.default_rng(0).permutation(642))
+    messages = []
+    for scale in (1, 1e-150, 1e150):
+        with pytest.raises(SymmetryFileError, match=r"moves points by 0\.\d+ sqrt\(area\)") as error:
+            load_symmetry(tmp_path / "s.npy", shape.mesh.moved(shape.mesh.verts * scale))
+        messages.append(str(error.value))
+    assert len(set(messages)) == 1
 
 
 FAULTS = {

@@ -6,9 +6,10 @@ import torch
 from references.shapes import blob, icosphere, rotation
 from scipy.spatial import cKDTree
 
+from torchqm.data.synthetic import creature, exact_maps
 from torchqm.geometry import Mesh
-from torchqm.symmetry import SymmetryGroup, find_reflection
-from torchqm.symmetry.extrinsic import _reflective_icp
+from torchqm.symmetry import SymmetryGroup, find_reflection, find_reflections
+from torchqm.symmetry.extrinsic import _images, _Planes, _reflective_icp
 from torchqm.testing import assert_orbit_equal
 
 
@@ -68,9 +69,13 @@ def test_shape_without_a_plane_is_not_convincing():
 def test_reflective_icp_moves_the_plane_as_well():
     points = blob(2).mesh.verts.numpy() + np.array([0.05, 0.3, -0.2])
     start = np.array([1.0, 0.03, -0.02]) / np.linalg.norm([1.0, 0.03, -0.02])
-    normal, offset = _reflective_icp(cKDTree(points), points, start, 0.0, steps=60)
-    np.testing.assert_allclose(normal, [1, 0, 0], atol=1e-9)
-    assert offset == pytest.approx(0.05, abs=1e-9)
+    other = np.array([0.0, 0.0, 1.0])
+    planes = _Planes(np.stack([start, other]), np.zeros(2))
+    found = _reflective_icp(cKDTree(points), points, planes, steps=60)
+    np.testing.assert_allclose(found.normals[0], [1, 0, 0], atol=1e-9)
+    assert found.offsets[0] == pytest.approx(0.05, abs=1e-9)
+    alone = _reflective_icp(cKDTree(points), points, planes.take([1]), steps=60)  # planes know nothing of one another
+    np.testing.assert_allclose(found.normals[1], alone.normals[0], atol=1e-12)
 
 
 def test_vertices_without_faces_are_no_images():
@@ -99,3 +104,32 @@ def test_few_samples_are_enough_for_an_exact_plane():
     assert torch.equal(found.map, group.maps[1])
     assert isinstance(found.offset, float)
     assert np.isfinite(found.spacing)
+
+
+@pytest.mark.parametrize(("kind", "number"), [("biped", 1), ("ellipsoid", 3), ("octopus", 8)])
+@pytest.mark.parametrize("retriangulate", [0, 3])
+def test_all_the_planes_of_a_shape(kind, number, retriangulate):
+    """Exactly as many as the creature has; each gives one of its reflections."""
+    body = creature(kind, 1500, retriangulate=retriangulate)
+    found = find_reflections(body.mesh)
+    assert len(found) == number
+    assert all(plane.convincing for plane in found)
+    normals = torch.stack([plane.normal for plane in found])
+    angles = torch.rad2deg(torch.arccos((normals @ normals.T).abs().clamp(max=1)))
+    assert float((angles + 180 * torch.eye(number)).min()) > 20
+    if not retriangulate:
+        exact = {tuple(row) for row in exact_maps(body, body).nearest_vertices().tolist()}
+        assert {tuple(plane.map.tolist()) for plane in found} <= exact
+    assert torch.equal(find_reflection(body.mesh).map, found[0].map)
+
+
+def test_mirror_images_of_two_planes_are_all_those_of_the_dihedral_group():
+    angle = np.pi / 5
+    normals = np.array([[1.0, 0.0, 0.0], [np.cos(angle), np.sin(angle), 0.0]])
+    point = np.array([0.3, -0.2, 0.1])  # on all of them
+    images = _images(_Planes(normals, normals @ point))
+    every = np.concatenate([normals, images.normals])
+    assert len(every) == 5
+    turns = np.sort(np.degrees(np.arctan2(every[:, 1], every[:, 0])) % 180)
+    np.testing.assert_allclose(np.diff(turns), 36, atol=1e-9)
+    np.testing.assert_allclose(images.offsets, images.normals @ point, atol=1e-12)

@@ -138,7 +138,8 @@ def fit_parameters(
     Raises:
         UserError: a mesh has fewer vertices than the eigenfunctions that were asked for.
     """
-    usable = {mesh.label: int((mesh.vertex_areas > 0).sum()) for mesh in meshes}
+    # at unit area: in the file's units the squares behind an area may be no doubles
+    usable = {mesh.label: int((mesh.normalized().vertex_areas > 0).sum()) for mesh in meshes}
     label = min(usable, key=lambda name: usable[name])
     n = usable[label]
     for asked, option in ((parameters.k, "--k"), (parameters.k_max if k_max_given else 0, "--k-max")):

@@ -34,6 +34,7 @@ def fmap_to_p2p(
     basis_y: SpectralBasis,
     time: float = 0.0,
     search: SurfaceSearch | None = None,
+    guide: SurfaceSearch | None = None,
 ) -> Int[Tensor, " Vx"]:
     """``T(x) = argmin_y || C delta_{x,t} - delta_{y,t} ||``: the vertex whose delta is nearest to the image of a delta.
 
@@ -45,6 +46,7 @@ def fmap_to_p2p(
         time: diffusion time, as in :func:`deltas`.
         search: a two-stage search on y, several times faster on large meshes and right nearly always; by default all
             vertices are compared.
+        guide: that of x, with which the search on y is faster again.
 
     Returns:
         ``p2p_xy`` ``(Vx,)``: for each vertex of x a vertex of y (always one that a face uses).
@@ -59,7 +61,7 @@ def fmap_to_p2p(
         raise ValueError(f"fmap_xy: expected shape ({basis_y.k}, {basis_x.k}), got {tuple(fmap_xy.shape)}")
     images = deltas(basis_x, time) @ fmap_xy.T
     if search is not None:
-        return search.nearest(images, deltas(basis_y, time))
+        return search.nearest(images, deltas(basis_y, time), guide)
     return nearest_used(images, basis_y, time)
 
 

@@ -41,7 +41,7 @@ def nearest_rows(queries: Float[Tensor, "Q D"], points: Float[Tensor, "P D"]) ->
         raise ValueError(f"queries have {queries.shape[1]} coordinates, points have {points.shape[1]}")
     if points.shape[0] == 0:
         raise ValueError("points: there are none to choose from")
-    if not (bool(torch.isfinite(queries).all()) and bool(torch.isfinite(points).all())):
+    if not bool(torch.isfinite(queries.sum() + points.sum())):  # NaN and infinities survive a sum
         raise ValueError("queries and points must be finite; a spectral coordinate is NaN or infinite")
     if queries.shape[0] * points.shape[0] <= _SMALL:
         # || q - p ||^2 without || q ||^2, which is the same for all points
@@ -63,15 +63,18 @@ def _blocked(queries: np.ndarray, points: np.ndarray, rows: int = 64) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSearch:
-    """Nearest vertices of a surface in two stages: among anchor vertices first, then around the best anchors.
+    """Nearest vertices of a surface in two stages: among anchor vertices first, then around the best anchor.
 
     Spectral coordinates are smooth on the surface, so the nearest vertex lies near the nearest anchor. The second stage
     looks at the vertices closest to that in space, and nowhere else: a search among V vertices costs little more than
-    one among the anchors. It can miss (``benchmarks/speed_pair.py`` prints how often, and by how far).
+    one among the anchors. Queries that are themselves the vertices of a surface need not even be compared with all
+    anchors: the partner of a vertex lies near those of the anchors around it. The search can miss
+    (``benchmarks/speed_pair.py`` prints how often, and by how far).
 
     Args:
         anchors: ``(A,)`` vertex ids, spread over the surface.
         around: ``(A, m)`` for each anchor the vertices closest to it in space, itself first.
+        close: ``(V, n)`` for each vertex its closest anchors in space, as indices into ``anchors``.
 
     Example:
         >>> line = torch.arange(10.0, dtype=torch.float64)[:, None]
@@ -82,9 +85,10 @@ class SurfaceSearch:
 
     anchors: Int[Tensor, " A"]
     around: Int[Tensor, "A m"]
+    close: Int[Tensor, "V n"]
 
     @classmethod
-    def build(cls, verts: Float[Tensor, "V D"], anchors: Int[Tensor, " A"], m: int = 96) -> "SurfaceSearch":
+    def build(cls, verts: Float[Tensor, "V D"], anchors: Int[Tensor, " A"], m: int = 96, n: int = 8) -> "SurfaceSearch":
         """Prepare the search on the vertices of a surface.
 
         Args:
@@ -92,40 +96,59 @@ class SurfaceSearch:
                 lie nowhere near the surface, or be passed as far away.
             anchors: ids of the first stage.
             m: vertices looked at around each anchor.
+            n: anchors near a vertex whose partners are tried for it.
         """
-        found = cKDTree(verts.numpy()).query(verts[anchors].numpy(), k=min(m, verts.shape[0]))[1]
-        return cls(anchors, torch.from_numpy(found.reshape(len(anchors), -1)))
+        everything, chosen = verts.numpy(), verts[anchors].numpy()
+        around = cKDTree(everything).query(chosen, k=min(m, len(everything)), workers=-1)[1]
+        close = cKDTree(chosen).query(everything, k=min(n, len(chosen)), workers=-1)[1]
+        return cls(
+            anchors,
+            torch.from_numpy(around.reshape(len(chosen), -1)),
+            torch.from_numpy(close.reshape(len(everything), -1)),
+        )
 
     def nearest(
-        self, queries: Float[Tensor, "Q K"], points: Float[Tensor, "V K"], n_anchors: int = 1
+        self, queries: Float[Tensor, "Q K"], points: Float[Tensor, "V K"], guide: "SurfaceSearch | None" = None
     ) -> Int[Tensor, " Q"]:
-        """For each query the nearest of the points around its ``n_anchors`` nearest anchors.
+        """For each query the nearest of the points around its nearest anchor.
 
         Args:
             queries: coordinates looked for.
             points: coordinates of all V vertices.
-            n_anchors: how many anchors are looked around.
+            guide: the search of the surface whose vertices the queries are, in their order: only the queries at its
+                anchors are compared with all anchors here, the others with the partners of the anchors close to them.
+
+        Raises:
+            ValueError: the guide is of a surface with another number of vertices.
         """
-        index = _faiss().IndexFlatL2(points.shape[1])
         queries32, points32 = _float32(queries), _float32(points)
-        index.add(np.ascontiguousarray(points32[self.anchors.numpy()]))
-        _, found = index.search(queries32, n_anchors)
+        anchor_points = points32[self.anchors.numpy()]
+        if guide is None:
+            stage = nearest_rows(torch.from_numpy(queries32), torch.from_numpy(anchor_points)).numpy()
+        else:
+            if guide.close.shape[0] != len(queries32):
+                raise ValueError(f"guide: has {guide.close.shape[0]} vertices, but there are {len(queries32)} queries")
+            at_anchors = torch.from_numpy(queries32[guide.anchors.numpy()])
+            partners = nearest_rows(at_anchors, torch.from_numpy(anchor_points)).numpy()[guide.close.numpy()]
+            stage = partners[np.arange(len(partners)), _closest(queries32, anchor_points, partners)]
         around = self.around.numpy()
         half = (points32**2).sum(1) / 2
-        best = np.full(len(queries32), -np.inf, dtype=np.float32)
-        out = np.zeros(len(queries32), dtype=np.int64)
-        for stage in found.T:
-            order = np.argsort(stage, kind="stable")
-            anchors, starts = np.unique(stage[order], return_index=True)
-            for anchor, mine in zip(anchors, np.split(order, starts)[1:], strict=True):
-                near = around[anchor]
-                value = queries32[mine] @ points32[near].T - half[near]
-                which = value.argmax(1)
-                value = value[np.arange(len(mine)), which]
-                better = value > best[mine]
-                out[mine[better]] = near[which[better]]
-                best[mine[better]] = value[better]
+        out = np.empty(len(queries32), dtype=np.int64)
+        order = np.argsort(stage, kind="stable")
+        anchors, starts = np.unique(stage[order], return_index=True)
+        for anchor, mine in zip(anchors, np.split(order, starts)[1:], strict=True):
+            near = around[anchor]
+            out[mine] = near[(queries32[mine] @ points32[near].T - half[near]).argmax(1)]
         return torch.from_numpy(out)
+
+
+def _closest(queries: np.ndarray, points: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+    """For each query which of its few candidates is nearest."""
+    half = (points**2).sum(1) / 2
+    values = np.empty(candidates.shape, dtype=points.dtype)
+    for column, ids in enumerate(candidates.T):
+        values[:, column] = np.einsum("qk,qk->q", queries, points[ids]) - half[ids]
+    return values.argmax(1)
 
 
 def _float32(values: Tensor) -> np.ndarray:

@@ -51,6 +51,7 @@ def quotient_icp(
     steps: int = 20,
     time: float = 0.0,
     width: float | None = None,
+    tolerance: float = 0.0,
 ) -> FMap:
     """Iterate: nearest deltas of the samples, then the isometry nearest to their correspondence matrix.
 
@@ -67,6 +68,7 @@ def quotient_icp(
         steps: number of iterations.
         time: diffusion time t of the deltas (area).
         width: if given, :func:`frequency_mask` of that width multiplies the matrix before the SVD.
+        tolerance: relative change of the map (Frobenius norm) below which the iteration stops; rounding always counts.
 
     Returns:
         The refined map.
@@ -81,12 +83,12 @@ def quotient_icp(
     sources = deltas(basis_x, time)[samples]
     targets = deltas(basis_y, time)
     mask = None if width is None else frequency_mask(basis_x.evals, basis_y.evals, width)
-    settled = torch.finfo(fmap_xy.dtype).eps ** 0.5
+    settled = max(tolerance, torch.finfo(fmap_xy.dtype).eps ** 0.5)
     for _ in range(steps):
         partners = nearest_used(sources @ fmap_xy.T, basis_y, time)
         correspondence = targets[partners].T @ sources
         last, fmap_xy = fmap_xy, nearest_isometry(correspondence if mask is None else correspondence * mask)
-        if float((fmap_xy - last).abs().max()) < settled:
+        if float((fmap_xy - last).norm()) < settled * float(fmap_xy.norm()):
             break
     return fmap_xy
 
@@ -99,6 +101,7 @@ def semi_quotient_icp(
     steps: int = 20,
     time: float = 0.0,
     width: float | None = 0.2,
+    tolerance: float = 0.0,
 ) -> FMap:
     """ICP from the full function space of x to the symmetric functions of y.
 
@@ -113,6 +116,7 @@ def semi_quotient_icp(
         steps: number of iterations.
         time: diffusion time of the deltas.
         width: see :func:`frequency_mask`; ``None`` gives the iteration exactly as printed.
+        tolerance: as in :func:`quotient_icp`.
 
     References:
         Paper, section 5, Semi-quotient ICP, and Lemma 5.1.
@@ -122,7 +126,7 @@ def semi_quotient_icp(
             f"the target has {basis_y.k} symmetric functions, the source only {basis_x.k} functions at all: "
             "a semi-quotient map goes onto the smaller space"
         )
-    return quotient_icp(fmap_xy, basis_x, basis_y, samples, steps, time, width)
+    return quotient_icp(fmap_xy, basis_x, basis_y, samples, steps, time, width, tolerance)
 
 
 def growing_sizes(start: int, stop: int, ratio: float = 1.2) -> list[int]:

@@ -20,6 +20,7 @@ from torchqm.geometry.topology import (
 
 __all__ = [
     "DEGENERATE_HEIGHT",
+    "EXTENTS",
     "MeshError",
     "MeshReport",
     "check_arrays",
@@ -37,6 +38,13 @@ Relative to the triangle itself, so no scale of the mesh changes the answer. ``1
 coordinates kept in single precision (6e-8) and far above that of double precision."""
 
 
+EXTENTS = (1e-60, 1e60)
+"""Smallest and largest extent of a mesh that :func:`check_mesh` lets through, in units of its coordinates.
+
+The norm of a triangle's normal needs fourth powers of lengths: between these, and for triangles up to ``1e-15`` of the
+mesh in size, they stay within double precision (1e-308 to 1e308) whether or not a step scales the mesh first."""
+
+
 class MeshError(ValueError):
     """A mesh that cannot be used; the message names the file (or the mesh) and the fault."""
 
@@ -50,7 +58,8 @@ class MeshReport:
         n_verts: vertices, unreferenced ones included.
         n_faces: triangles as given.
         euler: Euler characteristic, referenced vertices - edges + triangles.
-        component_areas: area of each connected piece, largest first, in squared units of the coordinates.
+        component_areas: area of each connected piece, largest first, in squared units of the coordinates (0 or infinite
+            where that is beyond double precision).
         n_welded_components: how many pieces would be left after :func:`weld`.
         n_unreferenced: vertices that no triangle (with three different corners) uses.
         n_duplicate_verts: vertices whose position an earlier vertex has exactly.
@@ -249,7 +258,7 @@ def inspect_mesh(mesh: Mesh) -> MeshReport:
         The counts; ``.warnings`` puts them into sentences.
 
     Raises:
-        MeshError: what :func:`check_arrays` raises.
+        MeshError: what :func:`check_arrays` raises, or coordinates whose difference is no double any more.
 
     Example:
         >>> report = inspect_mesh(Mesh.from_arrays(np.eye(3), [[0, 1, 2]]))
@@ -260,7 +269,10 @@ def inspect_mesh(mesh: Mesh) -> MeshReport:
     check_arrays(verts, given, mesh.label)
     distinct, first = face_masks(given)
     faces = given[distinct & first]
-    scale = float(np.abs(verts - verts[0]).max()) or 1.0  # 1e+-200 must not overflow when squared
+    with np.errstate(over="ignore"):
+        scale = float(np.abs(verts - verts[0]).max()) or 1.0  # 1e+-200 must not overflow when squared
+    if not np.isfinite(scale):
+        _check_extent(mesh)
     area, height, angle = triangle_shapes((verts - verts[0]) / scale, faces)
     table = edge_table(faces, mesh.n_verts)
     referenced = np.zeros(mesh.n_verts, dtype=bool)
@@ -270,6 +282,8 @@ def inspect_mesh(mesh: Mesh) -> MeshReport:
     pieces = component_areas(mesh.n_verts, table.edges, faces, area)
     joined = component_areas(mesh.n_verts, welded[table.edges], welded[faces], area) if n_duplicate else pieces
     total = float(area.sum())
+    with np.errstate(over="ignore"):
+        areas = pieces * scale * scale
     angle = np.degrees(angle)
     n_flat = int((height <= DEGENERATE_HEIGHT).sum())
     return MeshReport(
@@ -277,7 +291,7 @@ def inspect_mesh(mesh: Mesh) -> MeshReport:
         n_verts=mesh.n_verts,
         n_faces=mesh.n_faces,
         euler=int(referenced.sum()) - len(table.edges) + len(faces),
-        component_areas=tuple((pieces * scale**2).tolist()),
+        component_areas=tuple(areas.tolist()),
         n_welded_components=len(joined),
         n_unreferenced=int((~referenced).sum()),
         n_duplicate_verts=n_duplicate,
@@ -305,8 +319,11 @@ def check_mesh(mesh: Mesh) -> MeshReport:
         The report; what was merely handled is in ``.warnings``.
 
     Raises:
-        MeshError: what :func:`check_arrays` raises, a mesh without area, or one in several pieces.
+        MeshError: what :func:`check_arrays` raises, a mesh without area or in several pieces, or an extent outside
+            :data:`EXTENTS`.
     """
+    check_arrays(*mesh.numpy(), mesh.label)
+    _check_extent(mesh)
     report = inspect_mesh(mesh)
     if not report.relative_area > 0 or report.n_degenerate + report.n_repeated == report.n_faces:
         raise MeshError(f"{report.label}: the surface has no area (all {report.n_faces} triangles are degenerate)")
@@ -315,11 +332,30 @@ def check_mesh(mesh: Mesh) -> MeshReport:
     return report
 
 
+def _check_extent(mesh: Mesh) -> None:
+    """Refuse coordinates so small or large that areas and their squares would leave double precision."""
+    used = mesh.verts[mesh.referenced]  # a stray vertex makes a mesh no larger, but it counts where all are scaled
+    whole, surface = (float((x.amax(0) - x.amin(0)).max()) for x in (mesh.verts, used))  # may be infinite
+    small = 0 < surface < EXTENTS[0]
+    if not small and whole <= EXTENTS[1]:
+        return
+    extent = surface if small else whole
+    raise MeshError(
+        f"{mesh.label}: the coordinates are too {'small' if small else 'large'}: their extent is "
+        f"{f'{extent:.3g}' if np.isfinite(extent) else 'more than 1.8e+308'}, allowed are {EXTENTS[0]:g} to "
+        f"{EXTENTS[1]:g}; rescale the mesh (the maps do not depend on the unit of length)"
+    )
+
+
 def _describe_components(report: MeshReport) -> str:
-    """The sentence about the pieces: how many, their shares of the area, and whether welding helps."""
-    share = np.array(report.component_areas) / (report.area or 1.0)
-    shown = ", ".join(f"{100 * s:.3g}%" for s in share[:5]) + (", ..." if report.n_components > 5 else "")
-    text = f"{report.n_components} components with {shown} of the area, but one connected surface is needed"
+    """The sentence about the pieces: how many, their areas and shares of the whole, and whether welding helps."""
+    more = ", ..." if report.n_components > 5 else ""
+    areas = ", ".join(f"{a:.3g}" for a in report.component_areas[:5]) + more
+    shares = ", ".join(f"{100 * a / (report.area or 1.0):.3g}%" for a in report.component_areas[:5]) + more
+    text = (
+        f"{report.n_components} components with areas {areas} in squared units of the file ({shares} of the whole), "
+        "but one connected surface is needed"
+    )
     if report.n_welded_components < report.n_components:
         left = report.n_welded_components
         text += (

@@ -13,6 +13,7 @@ from torchqm.geometry.check import MeshError
 
 __all__ = ["READERS"]
 
+_OFF_EDGE = re.compile(r"(?:2\s+)?\d+\s+\d+")
 _OFF_HEADER = re.compile(r"^(?:(?:ST)?C?N?OFF\b|OFF(?=\d))")  # some writers glue the counts to the header: OFF490 518 0
 
 
@@ -112,6 +113,14 @@ def _read_off(path: Path) -> tuple[np.ndarray, np.ndarray]:
             f"{path}: truncated after line {text.number(len(text.lines) - 1)}: "
             f"expected {n_verts} vertices and {n_faces} faces, found {found}"
         )
+    more = text.lines[start + n_verts + n_faces :]
+    n_edges = counts[2] if len(counts) > 2 else 0  # hardly any file lists its edges, whatever it says here
+    if more and not (len(more) == n_edges and all(map(_OFF_EDGE.fullmatch, more))):
+        raise MeshError(
+            f"{path}: the header declares {n_verts} vertices and {n_faces} faces, so {n_verts + n_faces} lines, but "
+            f"{len(text.lines) - start} follow; the first too many is line "
+            f"{text.number(start + n_verts + n_faces)}: {more[0][:60]!r}"
+        )
     verts = text.table(range(start, start + n_verts), 3, "vertex")
     return verts, _off_faces(text, start + n_verts, n_faces)
 
@@ -170,11 +179,14 @@ def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if b"end_header" not in head:
         raise MeshError(f"{path}: truncated: the PLY header has no end_header")
     header = head.partition(b"end_header")[0].decode("ascii", errors="replace")
-    declared = {name: int(n) for name, n in re.findall(r"^element\s+(\w+)\s+(\d+)", header, re.MULTILINE)}
+    elements = [(name, int(n)) for name, n in re.findall(r"^element\s+(\S+)\s+(\d+)", header, re.MULTILINE)]
+    declared = dict(elements)
     n_verts, n_faces = declared.get("vertex", 0), declared.get("face", 0)
     if n_verts == 0 or n_faces == 0:
         what = "vertices" if n_verts == 0 else "faces"
         raise MeshError(f"{path}: no {what}: the PLY header declares {n_verts} vertices and {n_faces} faces")
+    if re.search(r"^format\s+ascii", header, re.MULTILINE):
+        _check_ply_lines(path, elements)
     verts, faces = _through_trimesh(path, "ply")
     # trimesh takes what it finds of a file that was cut off; a fan never has fewer triangles than polygons.
     if len(verts) < n_verts or len(faces) < n_faces:
@@ -183,6 +195,21 @@ def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
             f"found {len(verts)} and {len(faces)}"
         )
     return verts, faces
+
+
+def _check_ply_lines(path: Path, elements: list[tuple[str, int]]) -> None:
+    """Refuse a text PLY with more lines than its header declares; trimesh would leave them out without a word."""
+    lines = path.read_bytes().splitlines()
+    start = next(k for k, line in enumerate(lines) if line.startswith(b"end_header")) + 1
+    rows = [k for k in range(start, len(lines)) if lines[k].strip()]
+    total = sum(count for _, count in elements)
+    if len(rows) > total:
+        first = lines[rows[total]][:60].decode("ascii", errors="replace")
+        declared = ", ".join(f"{name} {count}" for name, count in elements)
+        raise MeshError(
+            f"{path}: the header declares {declared}, so {total} lines, but {len(rows)} follow; "
+            f"the first too many is line {rows[total] + 1}: {first!r}"
+        )
 
 
 def _read_stl(path: Path) -> tuple[np.ndarray, np.ndarray]:

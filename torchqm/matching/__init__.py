@@ -6,9 +6,10 @@ from torchqm.matching.parameters import MatchError, MatchParameters
 from torchqm.matching.pipeline import METHODS, Collection, find_symmetry, match, match_prepared
 from torchqm.matching.quotient import QuotientMatch, choose_halves, match_quotient, refine_by_icp, refine_by_odd_block
 from torchqm.matching.result import MatchResult, SymmetryResult
+from torchqm.matching.self_map import nearest_involution
 from torchqm.matching.semi_quotient import SemiQuotientMatch, match_semi_quotient, pull_back
 from torchqm.matching.shape import PreparedShape, prepare
-from torchqm.matching.transfer import SymmetryTransfer, nearest_involution, transfer_symmetry
+from torchqm.matching.transfer import SymmetryTransfer, transfer_symmetry
 
 __all__ = [
     "METHODS",

@@ -32,10 +32,10 @@ def basis_size(bases: Sequence[SpectralBasis], k: int) -> int:
 def shared_descriptors(bases: Sequence[SpectralBasis], parameters: MatchParameters) -> list[Float[Tensor, "_V C"]]:
     """The split descriptors of several shapes, at the same energies and on the same value ranges.
 
-    Computed from all the functions that the bases hold (cut at the smaller number), not from the first ``k``: the same
-    local shape, told more sharply.
+    Computed from ``k_max`` functions (or as many as the smallest basis holds), not from the first ``k``: the same local
+    shape, told more sharply.
     """
-    k = min(b.k for b in bases)
+    k = min(parameters.k_max, *(b.k for b in bases))
     bases = [b.truncate(k) for b in bases]
     if parameters.descriptor == "wks":
         energies = wave_energies(bases, parameters.n_descriptors)

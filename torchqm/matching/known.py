@@ -1,6 +1,6 @@
 """Where a shape's symmetry comes from: its mirror plane, the user, or a reference shape."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isfinite
 from typing import Any
 
@@ -12,11 +12,23 @@ from torchqm.matching.parameters import MatchError, MatchParameters
 from torchqm.matching.shape import PreparedShape
 from torchqm.matching.symmetry_file import MAX_RETURN_ERROR
 from torchqm.matching.transfer import transfer_symmetry
-from torchqm.symmetry.extrinsic import find_reflection
+from torchqm.symmetry.basis import symmetrized_basis
+from torchqm.symmetry.extrinsic import ExtrinsicReflection, find_reflections
 from torchqm.symmetry.group import SymmetryGroup
 from torchqm.symmetry.leftright import displacement, halves_of_reflection, persistence_clusters
 
-__all__ = ["KnownSymmetry", "extrinsic_symmetry", "given_symmetry", "no_symmetry", "transferred_symmetry"]
+__all__ = [
+    "KnownSymmetry",
+    "best_fitting",
+    "extrinsic_symmetry",
+    "given_symmetry",
+    "no_symmetry",
+    "transferred_symmetry",
+]
+
+
+N_COMPARED = 30
+"""Functions whose symmetric part is compared to tell reflections of a shape apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +41,7 @@ class KnownSymmetry:
         origin: ``extrinsic``, ``file``, ``transfer`` or ``none``.
         warnings: what is doubtful, with the numbers.
         details: numbers for the summary.
+        others: further reflections that the shape has just as well, each alone; see :func:`best_fitting`.
     """
 
     group: SymmetryGroup
@@ -36,6 +49,7 @@ class KnownSymmetry:
     origin: str
     warnings: list[str] = field(default_factory=list)
     details: dict[str, Any] = field(default_factory=dict)
+    others: tuple["KnownSymmetry", ...] = ()
 
     @property
     def known(self) -> bool:
@@ -63,38 +77,79 @@ def extrinsic_symmetry(shape: PreparedShape, max_residual: float = 0.02) -> Know
 
     Returns:
         The reflection, with a warning if its residual is more than the triangulation explains; above ``max_residual``
-        the trivial group, with a warning that gives the residual.
+        the trivial group, with a warning that gives the residual. Where several planes fit equally well they are in
+        ``others``, and a warning says how many.
 
     References:
         Paper, sections 6.2 and 7.
     """
-    found = find_reflection(shape.mesh)
-    numbers = (
-        f"rms {found.residual:.4f}, max {found.residual_max:.4f} of sqrt(area); vertex spacing {found.spacing:.4f}"
-    )
+    found, *more = find_reflections(shape.mesh)
+    if found.residual <= max_residual:
+        first, *others = (_reflection(shape, plane) for plane in (found, *more) if plane.residual <= max_residual)
+        if others:
+            first.warnings.append(
+                f"{shape.mesh.label}: {len(others)} more mirror plane(s) fit as well; only one reflection is used"
+            )
+        return replace(first, others=tuple(others))
+    text = f"{shape.mesh.label}: no mirror plane: the best one leaves a residual above {max_residual:g}"
+    numbers, details = _numbers(found)
+    none = no_symmetry(shape, [f"{text} ({numbers})"])
+    return replace(none, details=details)
+
+
+def _numbers(found: ExtrinsicReflection) -> tuple[str, dict[str, Any]]:
+    """How well a plane fits, as text and for the summary."""
+    text = f"rms {found.residual:.4f}, max {found.residual_max:.4f} of sqrt(area); vertex spacing {found.spacing:.4f}"
     details = {
         "residual": found.residual,
         "residual_max": found.residual_max,
         "spacing": found.spacing,
         "normal": found.normal.tolist(),
     }
-    name = shape.mesh.label
-    if found.residual > max_residual:
-        text = f"{name}: no mirror plane: the best one leaves a residual above {max_residual:g} ({numbers})"
-        return KnownSymmetry(
-            SymmetryGroup.trivial(shape.n_verts), torch.zeros_like(shape.basis.mass), "none", [text], details
-        )
+    return text, details
+
+
+def _reflection(shape: PreparedShape, found: ExtrinsicReflection) -> KnownSymmetry:
+    numbers, details = _numbers(found)
     warnings = []
-    if found.others:
-        warnings.append(
-            f"{name}: {found.others} more mirror plane(s) fit as well; only one reflection is used, "
-            "and on the other shape it may be another"
-        )
     if not found.convincing:
-        warnings.append(f"{name}: the mirror plane fits only roughly ({numbers})")
+        warnings.append(f"{shape.mesh.label}: the mirror plane fits only roughly ({numbers})")
     # Not the sign of the side alone: on the axis that is rounding, and would differ with the units of the file.
     sign = halves_of_reflection(shape.mesh, found.map, found.side(shape.mesh.verts))
     return KnownSymmetry(SymmetryGroup.from_reflection(found.map), sign, "extrinsic", warnings, details)
+
+
+def best_fitting(x: PreparedShape, y: PreparedShape, known_x: KnownSymmetry, known_y: KnownSymmetry) -> KnownSymmetry:
+    """Of a shape's several reflections the one that belongs to the reflection of the other shape.
+
+    Which of its planes comes first is chance. Of isometric shapes the quotients by matching reflections are isometric,
+    so their symmetric functions have the same eigenvalues; the reflection is taken for which these differ least.
+
+    Args:
+        x: the shape with several reflections.
+        y: the shape to match it to.
+        known_x: the first of them, with its ``others``.
+        known_y: the reflection of y.
+
+    Returns:
+        The reflection of x, with the relative differences of all in its ``details``.
+
+    References:
+        Paper, Lemma 3.2: the quotients of isometric shapes are isometric.
+    """
+    if not known_x.others or known_y.group.order != 2:
+        return known_x
+    k = min(N_COMPARED, x.basis.k, y.basis.k)
+    wanted = symmetrized_basis(y.basis.truncate(k), known_y.group).even_evals
+    choices = [known_x, *known_x.others]
+    differences = []
+    for choice in choices:
+        own = symmetrized_basis(x.basis.truncate(k), choice.group).even_evals
+        n = min(len(own), len(wanted))
+        differences.append(float((own[:n] - wanted[:n]).norm() / wanted[:n].norm().clamp_min(1e-300)))
+    best = choices[differences.index(min(differences))]
+    details = best.details | {"reflections_tried": [round(value, 4) for value in differences]}
+    return replace(best, warnings=known_x.warnings, details=details)
 
 
 def given_symmetry(shape: PreparedShape, maps: Tensor, origin: str = "file") -> KnownSymmetry:

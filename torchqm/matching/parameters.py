@@ -1,6 +1,7 @@
 """The numbers of the method in one place: the paper's (section 7.4) and the ones that measured better."""
 
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 __all__ = ["MatchError", "MatchParameters"]
 
@@ -21,9 +22,11 @@ class MatchParameters:
         splits: intervals s of the splitting (the paper: 5; 0 leaves it out).
         commutativity: weight w of the commutativity term, times the number of descriptors per basis function, with
             eigenvalues scaled to [0, 1].
-        self_commutativity: the same weight for the map of a shape to itself, whose descriptors agree exactly and so may
-            decide more (on the cats a weight of 1 halves the error that 100 gives).
-        icp_steps: steps of (semi-)quotient ICP (the paper: 20).
+        self_commutativity: the same weight for the map of a shape to itself; each gives a candidate, and the one that
+            commutes best is kept (on most of the cats a weight of 1 gives half the error of 100, on coarse meshes and
+            some centaurs it is the other way round).
+        icp_steps: steps of (semi-)quotient ICP, at most (the paper: 20).
+        icp_tolerance: relative change of the map (Frobenius norm) below which ICP stops before that.
         time: diffusion time of the deltas (1 = the area of the shape).
         n_samples: vertices, drawn by area, that stand for the surface.
         semi_width: width of the frequency mask in semi-quotient ICP; None is the iteration as printed.
@@ -38,8 +41,9 @@ class MatchParameters:
     n_descriptors: int = 100
     splits: int = 5
     commutativity: float = 100.0
-    self_commutativity: float = 1.0
+    self_commutativity: tuple[float, ...] = (1.0, 100.0)
     icp_steps: int = 20
+    icp_tolerance: float = 0.005
     time: float = 0.0
     n_samples: int = 2000
     semi_width: float | None = 0.2
@@ -58,10 +62,13 @@ class MatchParameters:
         for name in ("n_descriptors", "n_samples"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: must be at least 1")
-        for name in ("splits", "icp_steps", "commutativity", "self_commutativity", "time"):
+        for name in ("splits", "icp_steps", "icp_tolerance", "commutativity", "time"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}={getattr(self, name)}: must not be negative")
-
+        if not self.self_commutativity or min(self.self_commutativity) < 0:
+            raise ValueError(
+                f"self_commutativity={self.self_commutativity}: one weight or more are needed, none of them negative"
+            )
         if self.descriptor == "wks" and self.n_descriptors < 2:
             raise ValueError(f"n_descriptors={self.n_descriptors}: the wave kernel signature needs at least 2 energies")
         if self.semi_width is not None and self.semi_width <= 0:
@@ -72,12 +79,25 @@ class MatchParameters:
     @classmethod
     def paper(cls) -> "MatchParameters":
         """Section 7.4: k = 30, WKS with 100 energies, s = 5, 20 ICP steps, then ICP at k = 100 and 300."""
-        return cls(k_max=300, refinement="icp")
+        return cls(k_max=300, refinement="icp", icp_tolerance=0.0)
 
     def changed(self, **values: object) -> "MatchParameters":
         """A copy with some values changed, checked again."""
         return replace(self, **values)  # type: ignore[arg-type]
 
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> "MatchParameters":
+        """The parameters that :meth:`as_dict` wrote, as a ``summary.json`` keeps them.
+
+        Raises:
+            ValueError: a name that is no parameter, or a value that is not allowed.
+        """
+        unknown = sorted(set(values) - set(cls.__dataclass_fields__))
+        if unknown:
+            raise ValueError(f"{', '.join(unknown)}: no parameter of the matching")
+        plain: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+        return cls(**plain)
+
     def as_dict(self) -> dict[str, object]:
-        """Plain values, for ``summary.json``."""
-        return asdict(self)
+        """Plain values as JSON has them, for ``summary.json``."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}

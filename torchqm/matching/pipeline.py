@@ -16,6 +16,7 @@ from torchqm.geometry.mesh import Mesh
 from torchqm.matching.initial import basis_size
 from torchqm.matching.known import (
     KnownSymmetry,
+    best_fitting,
     extrinsic_symmetry,
     given_symmetry,
     no_symmetry,
@@ -247,6 +248,8 @@ class Collection:
             known_x = self.transfer(x, y, known_y)
         elif _gives_way(known_y, known_x):
             known_y = self.transfer(y, x, known_x)
+        elif known_x.others and known_y.known:
+            known_x = best_fitting(x, y, known_x, known_y)
         return known_x, known_y
 
     def expected_work(self, *meshes: Mesh | PreparedShape, symmetries: bool = True, match: bool = True) -> float:

@@ -1,14 +1,14 @@
 """What a map says about itself, without any ground truth: commutativity and orientation."""
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.fmap.convert import p2p_to_fmap
 from torchqm.geometry.mesh import Mesh
 from torchqm.spectral.basis import SpectralBasis
 
-__all__ = ["commutativity_score", "orientation_agreement"]
+__all__ = ["commutativity_score", "commutator_norm", "orientation_agreement"]
 
 
 def commutativity_score(
@@ -24,8 +24,14 @@ def commutativity_score(
     """
     k = min(k, basis_x.k, basis_y.k)
     small_x, small_y = basis_x.truncate(k), basis_y.truncate(k)
-    fmap_yx = p2p_to_fmap(p2p_xy, small_y, small_x)
-    right, left = fmap_yx * small_y.evals, small_x.evals[:, None] * fmap_yx
+    return commutator_norm(p2p_to_fmap(p2p_xy, small_y, small_x), small_y.evals, small_x.evals)
+
+
+def commutator_norm(
+    fmap_xy: Float[Tensor, "Ky Kx"], evals_x: Float[Tensor, " Kx"], evals_y: Float[Tensor, " Ky"]
+) -> float:
+    """``|| C Delta_x - Delta_y C || / (|| C Delta_x || + || Delta_y C ||)`` of a functional map; 0: an isometry."""
+    right, left = fmap_xy * evals_x, evals_y[:, None] * fmap_xy
     return float((right - left).norm() / (right.norm() + left.norm()).clamp_min(1e-300))
 
 

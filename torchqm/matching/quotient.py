@@ -47,11 +47,16 @@ class QuotientMatch:
 
         Which point of the orbit stands here is arbitrary, and neighbours may differ in it.
         """
-        return fmap_to_p2p(self.fmap, self.source.even, self.target.even, self.time, y.search)
+        return fmap_to_p2p(self.fmap, self.source.even, self.target.even, self.time, y.search, x.search)
 
 
 def match_quotient(
-    x: PreparedShape, y: PreparedShape, group_x: SymmetryGroup, group_y: SymmetryGroup, parameters: MatchParameters
+    x: PreparedShape,
+    y: PreparedShape,
+    group_x: SymmetryGroup,
+    group_y: SymmetryGroup,
+    parameters: MatchParameters,
+    values: tuple[Float[Tensor, "Vx C"], Float[Tensor, "Vy C"]] | None = None,
 ) -> QuotientMatch:
     """Algorithm 1 up to the point-to-orbit map: bases of L2+, descriptors, commutativity, least squares, quotient-ICP.
 
@@ -61,6 +66,7 @@ def match_quotient(
         group_x: symmetry group of the source.
         group_y: symmetry group of the target.
         parameters: ``k``, descriptors, ``commutativity``, ``icp_steps``, ``time``, ``n_samples`` are used.
+        values: the shared descriptors of both, if they are there already.
 
     References:
         Paper, section 4.3 and 4.4.
@@ -68,10 +74,12 @@ def match_quotient(
     k = basis_size([x.basis, y.basis], parameters.k)
     source = symmetrized_basis(x.basis.truncate(k), group_x)
     target = symmetrized_basis(y.basis.truncate(k), group_y)
-    values_x, values_y = shared_descriptors([x.basis, y.basis], parameters)
+    values_x, values_y = values or shared_descriptors([x.basis, y.basis], parameters)
     fmap = initial_fmap(source.even, target.even, values_x, values_y, parameters.commutativity)
     samples, among = x.samples[: parameters.n_samples], target.even.restricted(y.anchors)
-    fmap = quotient_icp(fmap, source.even, among, samples, parameters.icp_steps, parameters.time)
+    fmap = quotient_icp(
+        fmap, source.even, among, samples, parameters.icp_steps, parameters.time, tolerance=parameters.icp_tolerance
+    )
     return QuotientMatch(source, target, fmap, parameters.time)
 
 
@@ -171,4 +179,5 @@ def _icp_at_100_and(
 
 def dense_map(fmap: Float[Tensor, "Ky Kx"], x: PreparedShape, y: PreparedShape) -> Int[Tensor, " Vx"]:
     """The vertex of y for each vertex of x, from a functional map between the first functions of their full bases."""
-    return fmap_to_p2p(fmap, x.basis.truncate(fmap.shape[1]), y.basis.truncate(fmap.shape[0]), search=y.search)
+    small_x, small_y = x.basis.truncate(fmap.shape[1]), y.basis.truncate(fmap.shape[0])
+    return fmap_to_p2p(fmap, small_x, small_y, search=y.search, guide=x.search)

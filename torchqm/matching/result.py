@@ -136,6 +136,12 @@ def write_npz(path: str | Path, **arrays: np.ndarray) -> Path:
 
 
 def write_json(path: str | Path, content: dict[str, Any]) -> Path:
-    """Write a dictionary as indented JSON, whole or not at all."""
-    text = json.dumps(content, indent=2, ensure_ascii=False, default=str) + "\n"
+    """Write a dictionary as indented JSON, whole or not at all; numbers that are not finite become ``null``.
+
+    Raises:
+        TypeError: a value that JSON has no type for, such as a tensor or a path.
+        ValueError: a dictionary or list that holds itself.
+    """
+    plain = json.loads(json.dumps(content), parse_constant=lambda _: None)  # JSON has no NaN and no Infinity
+    text = json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     return write_whole(path, lambda file: file.write(text.encode()))

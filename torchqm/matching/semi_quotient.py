@@ -29,6 +29,7 @@ class SemiQuotientMatch:
         even: ``(K+_y, K+_x)``, R restricted to that L2+: a square isometry.
         time: diffusion time of the deltas.
         search: how dense maps onto the target are searched for.
+        guide: the same of the source.
     """
 
     fmap: Float[Tensor, "Key Kx"]
@@ -37,6 +38,7 @@ class SemiQuotientMatch:
     even: Float[Tensor, "Key Kex"]
     time: float = 0.0
     search: SurfaceSearch | None = None
+    guide: SurfaceSearch | None = None
 
     @cached_property
     def orbit_map(self) -> Int[Tensor, " Vx"]:
@@ -44,11 +46,15 @@ class SemiQuotientMatch:
 
         Which point of the orbit stands here is arbitrary and may differ between neighbours.
         """
-        return fmap_to_p2p(self.fmap, self.source.full, self.target.even, self.time, self.search)
+        return fmap_to_p2p(self.fmap, self.source.full, self.target.even, self.time, self.search, self.guide)
 
 
 def match_semi_quotient(
-    x: PreparedShape, y: PreparedShape, group_y: SymmetryGroup, parameters: MatchParameters
+    x: PreparedShape,
+    y: PreparedShape,
+    group_y: SymmetryGroup,
+    parameters: MatchParameters,
+    values: tuple[Float[Tensor, "Vx C"], Float[Tensor, "Vy C"]] | None = None,
 ) -> SemiQuotientMatch:
     """Match a shape without known symmetry to one whose symmetry group is given.
 
@@ -59,6 +65,7 @@ def match_semi_quotient(
         y: target.
         group_y: symmetry group of the target.
         parameters: ``k``, descriptors, ``icp_steps``, ``semi_width``, ``time`` are used.
+        values: the shared descriptors of both, if they are there already.
 
     References:
         Paper, section 5 and Lemma 5.1.
@@ -66,16 +73,23 @@ def match_semi_quotient(
     k = basis_size([x.basis, y.basis], parameters.k)
     basis_x = x.basis.truncate(k)
     target = symmetrized_basis(y.basis.truncate(k), group_y)
-    values_x, values_y = shared_descriptors([x.basis, y.basis], parameters)
+    values_x, values_y = values or shared_descriptors([x.basis, y.basis], parameters)
     fmap = initial_fmap(basis_x, target.even, values_x, values_y, parameters.commutativity)
     samples = x.samples[: parameters.n_samples]
     among = target.even.restricted(y.anchors)
     fmap = semi_quotient_icp(
-        fmap, basis_x, among, samples, parameters.icp_steps, parameters.time, parameters.semi_width
+        fmap,
+        basis_x,
+        among,
+        samples,
+        parameters.icp_steps,
+        parameters.time,
+        parameters.semi_width,
+        parameters.icp_tolerance,
     )
     fmap = nearest_isometry(fmap)
     source = split_by_projector(basis_x, fmap.T @ fmap)
-    return SemiQuotientMatch(fmap, target, source, fmap @ source.even_coeffs, parameters.time, y.search)
+    return SemiQuotientMatch(fmap, target, source, fmap @ source.even_coeffs, parameters.time, y.search, x.search)
 
 
 def sharpen_orbit_map(
@@ -110,7 +124,8 @@ def sharpen_orbit_map(
         [*sizes, k],
         parameters.semi_width,
     )
-    return fmap_to_p2p(fmap, x.basis.truncate(fmap.shape[1]), even_y.truncate(fmap.shape[0]), search=y.search)
+    small_x, small_y = x.basis.truncate(fmap.shape[1]), even_y.truncate(fmap.shape[0])
+    return fmap_to_p2p(fmap, small_x, small_y, search=y.search, guide=x.search)
 
 
 def pull_back(values: Float[Tensor, "Vy C"], orbit_map: Int[Tensor, " Vx"]) -> Float[Tensor, "Vx C"]:

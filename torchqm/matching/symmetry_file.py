@@ -45,8 +45,9 @@ def return_error(mesh: Mesh, reflection: Int[Tensor, " V"]) -> float:
         mesh: the shape, any scale.
         reflection: ``(V,)`` vertex map of it.
     """
-    moved = (mesh.verts - mesh.verts[reflection[reflection]]).norm(dim=1)
-    return float((moved * mesh.vertex_areas).sum()) / mesh.area**1.5
+    unit = mesh.normalized()  # area**1.5 of the file's units may be no double
+    moved = (unit.verts - unit.verts[reflection[reflection]]).norm(dim=1)
+    return float((moved * unit.vertex_areas).sum())
 
 
 def load_symmetry(path: str | Path, mesh: Mesh) -> SymmetryFile:

@@ -1,6 +1,7 @@
 """The mirror plane of an undeformed shape: many starts, refined by reflective ICP (paper, sections 6.2 and 7)."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,9 +12,7 @@ from torch import Tensor
 from torchqm.geometry.mesh import Mesh
 from torchqm.geometry.sampling import area_samples
 
-__all__ = ["ExtrinsicReflection", "find_reflection"]
-
-Plane = tuple[np.ndarray, float]
+__all__ = ["ExtrinsicReflection", "find_reflection", "find_reflections"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +25,6 @@ class ExtrinsicReflection:
         map: ``(V,)`` for each vertex the vertex nearest to its mirror image.
         residual: root mean square distance (by area) from mirrored vertices to the surface's vertices / sqrt(area).
         residual_max: the largest such distance / sqrt(area).
-        others: how many planes of a clearly different direction (30 degrees or more) fit nearly as well.
         spacing: root mean square distance from a vertex to its nearest neighbour / sqrt(area): the residual cannot be
             expected below it where the triangulation is not symmetric.
     """
@@ -37,7 +35,6 @@ class ExtrinsicReflection:
     residual: float
     residual_max: float
     spacing: float
-    others: int = 0
 
     def side(self, verts: Float[Tensor, "V 3"]) -> Float[Tensor, " V"]:
         """Signed distance of points from the plane."""
@@ -54,23 +51,29 @@ class ExtrinsicReflection:
 
 
 def find_reflection(mesh: Mesh, n_samples: int = 500, n_refine: int = 3, seed: int = 0) -> ExtrinsicReflection:
-    """Find the plane in which the shape is most nearly its own mirror image.
+    """The first of :func:`find_reflections`: the plane in which the shape is most nearly its own mirror image."""
+    return find_reflections(mesh, n_samples, n_refine, seed)[0]
+
+
+def find_reflections(mesh: Mesh, n_samples: int = 500, n_refine: int = 3, seed: int = 0) -> list[ExtrinsicReflection]:
+    """Find the planes in which the shape is most nearly its own mirror image.
 
     Candidates are the three principal planes and a spread of directions over the half sphere, all through the
-    centroid. Each is improved by a few steps of reflective ICP on a sample, the best ones to convergence on more
-    points, and the one with the least residual is evaluated on all vertices. One step: mirror the points, find their
+    centroid. Each is improved by a few steps of reflective ICP on a sample, the better ones by more of them; those of
+    different directions are brought to convergence on more points. One step: mirror the points, find their
     nearest vertices, and take the plane that best maps the points to these partners (normal: eigenvector of least
     eigenvalue of ``sum x y^T + y x^T``, centred; offset through the mean midpoint).
 
     Args:
         mesh: the shape; any scale.
         n_samples: points in the first stage.
-        n_refine: candidates that reach the second stage.
+        n_refine: candidates that reach the last stage at least; more do where more fit as well.
         seed: of the samples.
 
     Returns:
-        The reflection with its residuals. Nothing is refused here: a shape without mirror plane gets a large residual,
-        and ``convincing`` says so.
+        The best plane, and after it those that fit as well as far as the triangulation tells (their directions differ
+        by 10 degrees or more): a box has three, a regular octopus eight. Nothing is refused here: a shape without
+        mirror plane gets one with a large residual, and ``convincing`` says so.
 
     References:
         Paper, section 6.2 (the undeformed shape's reflection is assumed known) and section 7.
@@ -84,34 +87,90 @@ def find_reflection(mesh: Mesh, n_samples: int = 500, n_refine: int = 3, seed: i
     tree = cKDTree(verts[used])
     few, many = (verts[area_samples(mesh, min(n, used.size), seed).numpy()] for n in (n_samples, 4 * n_samples))
     coarse = cKDTree(verts[area_samples(mesh, min(5000, used.size), seed).numpy()])
+    spacing = float(np.sqrt((np.asarray(tree.query(many, k=2)[0])[:, 1] ** 2).mean()))
+    coarse_spacing = float(np.sqrt((np.asarray(coarse.query(few, k=2)[0])[:, 1] ** 2).mean()))
 
     _, axes = np.linalg.eigh((verts * weights[:, None]).T @ verts)
-    starts: list[Plane] = [(axis, 0.0) for axis in np.concatenate([axes.T, _half_sphere(45)])]
-    candidates = [_reflective_icp(coarse, few, normal, offset, steps=8) for normal, offset in starts]
-    order = np.argsort([_rms(coarse, few, normal, offset) for normal, offset in candidates], kind="stable")
-    best = [candidates[i] for i in order[:n_refine].tolist()]
-    refined = [_reflective_icp(tree, many, normal, offset, steps=30) for normal, offset in best]
-    fits = [_rms(tree, many, normal, offset) for normal, offset in refined]
-    normal, offset = refined[int(np.argmin(fits))]
-    spacing = float(np.sqrt((np.asarray(tree.query(many, k=2)[0])[:, 1] ** 2).mean()))
-    rivals = [p for p, fit in zip(refined, fits, strict=True) if fit**2 <= min(fits) ** 2 + (spacing / 2) ** 2]
-    others: list[np.ndarray] = []
-    for rival, _ in rivals:
-        if all(abs(rival @ known) < np.cos(np.pi / 6) for known in [normal, *others]):
-            others.append(rival)
-    if normal[np.argmax(np.abs(normal))] < 0:
-        normal, offset = -normal, -offset
+    directions = np.concatenate([axes.T, _half_sphere(45)])
+    planes = _Planes(directions, np.zeros(len(directions)))
+    for steps, keep in ((3, 24), (5, 16)):
+        planes, fits = _ranked(coarse, few, _reflective_icp(coarse, few, planes, steps))
+        planes = planes.take(slice(keep))
+    planes, fits = _different(planes, fits[: len(planes.offsets)])
+    good = int((fits <= fits[0] + coarse_spacing).sum())
+    planes, fits = _ranked(tree, many, _reflective_icp(tree, many, planes.take(slice(max(n_refine, good))), 30))
+    enough = np.hypot(fits[0], spacing / 2)
+    planes = planes.take(fits <= enough)
+    # The mirror image of one plane in another is a plane as good: with a few of a dihedral group come all.
+    images = _reflective_icp(tree, many, _images(planes), 30)
+    planes = planes.join(images.take(_fits(tree, many, images) <= enough))
+    planes, _ = _different(planes, np.zeros(len(planes.offsets)))
+    found = []
+    for normal, offset in zip(planes.normals, planes.offsets, strict=True):
+        if normal[np.argmax(np.abs(normal))] < 0:
+            normal, offset = -normal, -offset
+        distance, partner = _nearest(tree, verts - 2 * np.outer(verts @ normal - offset, normal))
+        found.append(
+            ExtrinsicReflection(
+                normal=torch.from_numpy(normal.copy()),
+                offset=float((offset + normal @ centre) * scale),
+                map=torch.from_numpy(used[partner]),
+                residual=float(np.sqrt(weights @ distance**2)),
+                residual_max=float(distance[used].max()),
+                spacing=spacing,
+            )
+        )
+    return found
 
-    distance, partner = _nearest(tree, _mirror(verts, normal, offset))
-    return ExtrinsicReflection(
-        normal=torch.from_numpy(normal.copy()),
-        offset=float((offset + normal @ centre) * scale),
-        map=torch.from_numpy(used[partner]),
-        residual=float(np.sqrt(weights @ distance**2)),
-        residual_max=float(distance[used].max()),
-        spacing=spacing,
-        others=len(others),
-    )
+
+class _Planes(NamedTuple):
+    """``{x : normal . x = offset}`` for several planes at once: ``(P, 3)`` unit normals and ``(P,)`` offsets."""
+
+    normals: np.ndarray
+    offsets: np.ndarray
+
+    def take(self, which: np.ndarray | slice | list[int]) -> "_Planes":
+        return _Planes(self.normals[which], self.offsets[which])
+
+    def join(self, other: "_Planes") -> "_Planes":
+        return _Planes(np.concatenate([self.normals, other.normals]), np.concatenate([self.offsets, other.offsets]))
+
+    def mirror(self, points: np.ndarray) -> np.ndarray:
+        """``(P, N, 3)``: the points mirrored in each plane."""
+        heights = self.normals @ points.T - self.offsets[:, None]
+        return points - 2 * heights[:, :, None] * self.normals[:, None, :]
+
+
+def _ranked(tree: cKDTree, points: np.ndarray, planes: _Planes) -> tuple[_Planes, np.ndarray]:
+    """Planes by their root mean square distance, best first, and these distances."""
+    fits = _fits(tree, points, planes)
+    order = np.argsort(fits, kind="stable")
+    return planes.take(order), fits[order]
+
+
+def _different(planes: _Planes, fits: np.ndarray, degrees: float = 10.0) -> tuple[_Planes, np.ndarray]:
+    """Of planes that nearly agree in direction only the first."""
+    near = np.abs(planes.normals @ planes.normals.T) > np.cos(np.radians(degrees))
+    kept: list[int] = []
+    for i in range(len(near)):
+        if not near[i, kept].any():
+            kept.append(i)
+    return planes.take(kept), fits[kept]
+
+
+def _images(planes: _Planes, most: int = 16) -> _Planes:
+    """Mirror images of planes in one another, and of these again, as far as they have new directions."""
+    known = planes
+    number = 0
+    while number < len(known.offsets) < most:
+        normal, offset = known.normals[number], known.offsets[number]
+        cosines = planes.normals @ normal
+        images = _Planes(
+            normal - 2 * cosines[:, None] * planes.normals, np.asarray(offset - 2 * cosines * planes.offsets)
+        )
+        known, _ = _different(known.join(images), np.zeros(len(known.offsets) + len(cosines)))
+        number += 1
+    return known.take(slice(len(planes.offsets), None))
 
 
 def _half_sphere(n: int) -> np.ndarray:
@@ -122,28 +181,31 @@ def _half_sphere(n: int) -> np.ndarray:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
 
 
-def _mirror(points: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
-    return points - 2 * np.outer(points @ normal - offset, normal)
-
-
 def _nearest(tree: cKDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    distance, index = tree.query(points)
+    distance, index = tree.query(points, workers=-1)
     return np.asarray(distance), np.asarray(index)
 
 
-def _rms(tree: cKDTree, points: np.ndarray, normal: np.ndarray, offset: float) -> float:
-    return float(np.sqrt((_nearest(tree, _mirror(points, normal, offset))[0] ** 2).mean()))
+def _fits(tree: cKDTree, points: np.ndarray, planes: _Planes) -> np.ndarray:
+    """``(P,)`` root mean square distance of the mirrored points from the surface."""
+    return np.sqrt((_nearest(tree, planes.mirror(points))[0] ** 2).mean(1))
 
 
-def _reflective_icp(tree: cKDTree, points: np.ndarray, normal: np.ndarray, offset: float, steps: int) -> Plane:
+def _reflective_icp(tree: cKDTree, points: np.ndarray, planes: _Planes, steps: int) -> _Planes:
+    """Steps of reflective ICP for all the planes at once; those that no longer change are left alone."""
+    normals, offsets = planes.normals.copy(), planes.offsets.copy()
+    moving = np.arange(len(offsets))
     for _ in range(steps):
-        partners = np.asarray(tree.data)[_nearest(tree, _mirror(points, normal, offset))[1]]
-        middle = (points.mean(0) + partners.mean(0)) / 2
-        cross = (points - middle).T @ (partners - middle)
-        new = np.linalg.eigh(cross + cross.T)[1][:, 0]
-        new = new if new @ normal >= 0 else -new
-        shift = float(new @ middle)
-        if np.linalg.norm(new - normal) + abs(shift - offset) < 1e-9:
+        if not moving.size:
             break
-        normal, offset = new, shift
-    return normal, offset
+        now = _Planes(normals[moving], offsets[moving])
+        partners = np.asarray(tree.data)[_nearest(tree, now.mirror(points))[1]]
+        middle = (points.mean(0) + partners.mean(1)) / 2
+        cross = (points - middle[:, None]).transpose(0, 2, 1) @ (partners - middle[:, None])
+        new = np.linalg.eigh(cross + cross.transpose(0, 2, 1))[1][:, :, 0]
+        new *= np.where((new * now.normals).sum(1) < 0, -1.0, 1.0)[:, None]
+        shift = (new * middle).sum(1)
+        change = np.linalg.norm(new - now.normals, axis=1) + np.abs(shift - now.offsets)
+        normals[moving], offsets[moving] = new, shift
+        moving = moving[change >= 1e-9]
+    return _Planes(normals, offsets)

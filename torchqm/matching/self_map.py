@@ -1,0 +1,165 @@
+"""The functional map of a shape's own reflection: candidates, the best of them, its refinement (section 6.1)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchqm.fmap.convert import p2p_to_fmap
+from torchqm.fmap.refine import growing_sizes, quotient_icp, upsample
+from torchqm.fmap.solve import solve_fmap
+from torchqm.matching.initial import basis_size, shared_descriptors, unit_columns_pair
+from torchqm.matching.parameters import MatchParameters
+from torchqm.matching.quality import commutator_norm
+from torchqm.matching.shape import PreparedShape
+from torchqm.symmetry.group import SymmetryGroup
+
+__all__ = [
+    "SelfMap",
+    "best_self_map",
+    "conjugate_reflection",
+    "nearest_involution",
+    "self_map_from_halves",
+    "self_maps_from_halves",
+]
+
+SelfFMap = Float[Tensor, "K K"]
+
+K_CHOICE = 100
+"""Functions at which candidates are compared: at 30 a good and a bad one commute nearly as well."""
+
+
+@dataclass(frozen=True, eq=False)
+class SelfMap:
+    """The functional map of a reflection, and the candidates that it was chosen from.
+
+    Args:
+        fmap: ``(K, K)`` refined.
+        chosen: which of the candidates it grew from.
+        scores: commutativity of each candidate (0: an isometry) where they were compared; one that is close to the
+            identity counts as infinite.
+    """
+
+    fmap: SelfFMap
+    chosen: int
+    scores: tuple[float, ...]
+
+
+def self_map_from_halves(
+    x: PreparedShape, sign: Float[Tensor, " V"], parameters: MatchParameters
+) -> Float[Tensor, "K K"]:
+    """The refined functional map of a reflection whose left and right are known (paper, section 6.1, step 4)."""
+    return best_self_map(self_maps_from_halves(x, sign, parameters), x, parameters).fmap
+
+
+def self_maps_from_halves(
+    x: PreparedShape,
+    sign: Float[Tensor, " V"],
+    parameters: MatchParameters,
+    values: Float[Tensor, "V C"] | None = None,
+) -> list[Float[Tensor, "K K"]]:
+    """Solve ``S f = f`` and ``S (eps f) = -eps f`` for all descriptors f, then refine by ICP; one map a weight.
+
+    Args:
+        x: the shape.
+        sign: its left-right map eps.
+        parameters: ``k``, descriptors, ``icp_steps``; each of ``self_commutativity`` gives a candidate, as no single
+            weight is best on all shapes.
+        values: descriptors f, if they are there already.
+
+    References:
+        Paper, section 6.1, symmetry reconstruction.
+    """
+    basis = x.basis.truncate(basis_size([x.basis], parameters.k))
+    if values is None:
+        (values,) = shared_descriptors([x.basis], parameters)
+    even, odd = basis.coefficients(values), basis.coefficients(sign[:, None] * values)
+    f, g = unit_columns_pair(torch.cat([even, odd], 1), torch.cat([even, -odd], 1))
+    samples, among = x.samples[: parameters.n_samples], basis.restricted(x.anchors)
+    found: list[Tensor] = []
+    for weight in parameters.self_commutativity:
+        fmap = solve_fmap(f, g, basis.evals, basis.evals, weight * f.shape[1] / basis.k, ridge=1e-9)
+        fmap = quotient_icp(
+            fmap, basis, among, samples, parameters.icp_steps, parameters.time, tolerance=parameters.icp_tolerance
+        )
+        found.append(fmap if parameters.refinement == "icp" else nearest_involution(fmap))
+    return found
+
+
+def conjugate_reflection(
+    fmap_xy: Float[Tensor, "K K"], group_y: SymmetryGroup, y: PreparedShape
+) -> Float[Tensor, "K K"]:
+    """The reflection of y seen from x: ``C^-1 S_y C``, made an involution.
+
+    Args:
+        fmap_xy: orthonormal map of the functions on x to those on y.
+        group_y: ``{id, S_y}``.
+        y: the shape that the map goes to.
+    """
+    basis = y.basis.truncate(fmap_xy.shape[0])
+    return nearest_involution(fmap_xy.T @ p2p_to_fmap(group_y.maps[1], basis, basis) @ fmap_xy)
+
+
+def best_self_map(
+    candidates: Sequence[Float[Tensor, "_K _K"]], x: PreparedShape, parameters: MatchParameters
+) -> SelfMap:
+    """Grow all candidates to a hundred functions, keep the one that commutes best with the Laplacian, refine it.
+
+    A functional map of an isometry commutes with the Laplacian, and on TOSCA the candidate with the smallest commutator
+    is nearly always the one of least error. Candidates close to the identity, which commutes with everything, are out.
+
+    Args:
+        candidates: functional maps of the shape to itself, of any sizes.
+        x: the shape.
+        parameters: of the refinement.
+
+    Raises:
+        ValueError: there are no candidates.
+    """
+    if not candidates:
+        raise ValueError("candidates: there must be at least one")
+    k = min(K_CHOICE, parameters.k_max, x.basis.k)
+    grown: list[Tensor] = []
+    for number, candidate in enumerate(candidates):
+        twins = [j for j in range(number) if candidates[j].shape == candidate.shape]
+        near = [j for j in twins if float((candidates[j] - candidate).norm()) < 0.05 * float(candidate.norm())]
+        grown.append(grown[near[0]] if near else _grow(candidate, x, parameters, k))
+    scores = tuple(_score(fmap, x) for fmap in grown)
+    chosen = scores.index(min(scores))
+    return SelfMap(_grow(grown[chosen], x, parameters, parameters.k_max), chosen, scores)
+
+
+def _score(fmap: Tensor, x: PreparedShape, most_trace: float = 0.7) -> float:
+    """Commutator norm; infinite where the even functions are so many more than the odd ones that little can move."""
+    size = fmap.shape[0]
+    if float(fmap.diagonal().sum()) > most_trace * size:
+        return float("inf")
+    evals = x.basis.evals[:size]
+    return commutator_norm(fmap, evals, evals)
+
+
+def nearest_involution(matrix: Float[Tensor, "K K"]) -> Float[Tensor, "K K"]:
+    """The involution ``C = C^T = C^-1`` nearest to a matrix: the eigenvalues of its symmetric part become +-1.
+
+    Example:
+        >>> nearest_involution(torch.tensor([[0.1, 0.9], [0.7, 0.0]])).abs().round().tolist()
+        [[0.0, 1.0], [1.0, 0.0]]
+    """
+    weights, vectors = torch.linalg.eigh((matrix + matrix.T) / 2)
+    return (vectors * torch.where(weights < 0, -1.0, 1.0)) @ vectors.T
+
+
+def _grow(fmap: Tensor, x: PreparedShape, parameters: MatchParameters, k: int) -> Tensor:
+    """Refine a self-map up to ``k`` functions by the way that ``parameters.refinement`` names."""
+    k = min(k, x.basis.k)
+    if parameters.refinement == "none" or k <= fmap.shape[0]:
+        return fmap
+    samples, among = x.samples[: parameters.n_samples], x.basis.restricted(x.anchors)
+    if parameters.refinement == "icp":  # section 7.4: five steps at 100, three at 300
+        return upsample(fmap, x.basis, among, samples, [k], steps=5 if k <= K_CHOICE else 3)
+    for size in growing_sizes(fmap.shape[0], k, parameters.growth):
+        # Without the projection the self-map drifts towards the identity, the best map of a shape to itself.
+        fmap = nearest_involution(upsample(fmap, x.basis, among, samples, [size]))
+    return fmap
