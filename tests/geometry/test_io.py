@@ -296,6 +296,9 @@ def test_bad_vert_and_tri(tmp_path):
     write(tmp_path, "a.tri", "1 2 4\n2 5\n")
     with pytest.raises(MeshError, match=r"a\.tri: line 2: expected face 1 of 2 \(3 numbers\), found '2 5'"):
         load_mesh(tmp_path / "a.vert")
+    write(tmp_path, "a.tri", "1 2 4\n2 5 4 1\n")  # a quad: half of it would be lost
+    with pytest.raises(MeshError, match=r"a\.tri: line 2: expected a triangle: 3 vertex ids and no more, found"):
+        load_mesh(tmp_path / "a.tri")
     write(tmp_path, "a.tri", "")
     with pytest.raises(MeshError, match=r"a\.tri: the file is empty"):
         load_mesh(tmp_path / "a.vert")

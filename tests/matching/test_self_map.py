@@ -9,6 +9,7 @@ from torchqm.matching import nearest_involution
 from torchqm.matching.self_map import (
     best_self_map,
     conjugate_reflection,
+    reflection_score,
     self_map_from_halves,
     self_maps_from_halves,
 )
@@ -62,11 +63,26 @@ def test_the_best_candidate_wins_wherever_it_stands(exact):
 
 
 def test_the_identity_is_no_reflection(exact):
-    """It commutes perfectly, and would always win."""
-    rough = true_map(exact, 30) + 0.03 * noise(30, 30)
+    """It commutes perfectly, and would always win if too many even functions were no fault."""
+    rough = nearest_involution(true_map(exact, 30) + 0.03 * noise(30, 30))
     found = best_self_map([identity(30), rough], exact.x, FAST)
     assert found.chosen == 1
-    assert found.scores[0] == float("inf")
+    assert reflection_score(identity(25), exact.x) == pytest.approx(0.5 * (1 - 2.2 / 5))
+    assert reflection_score(true_map(exact, 30), exact.x) < 1e-6
+
+
+def test_a_witness_supports_its_like(exact):
+    """Two candidates of nearly equal score: the one that the witness agrees with is taken."""
+    parameters = FAST.changed(refinement="none")
+    true = true_map(exact, 30)
+    generator = torch.linalg.matrix_exp(0.1 * (noise(30, 30) - noise(30, 30).T))
+    rough = generator @ true @ generator.T
+    other = nearest_involution(noise(30, 30, seed=3))
+    found = best_self_map([true, rough, other], exact.x, parameters, witness=0)
+    plain = best_self_map([true, rough, other], exact.x, parameters)
+    gaps = [b - a for a, b in zip(plain.scores, found.scores, strict=True)]
+    assert gaps[0] == 0
+    assert 0 < gaps[1] < 0.1 < gaps[2] < 0.6
 
 
 def test_equal_candidates_have_equal_scores(exact):

@@ -282,6 +282,9 @@ def _read_vert_tri(path: Path) -> tuple[np.ndarray, np.ndarray]:
             raise MeshError(f"{part}: no such file; {other.name} needs it beside itself")
     positions, triangles = _Lines(vert), _Lines(tri)
     verts = positions.table(range(len(positions.lines)), 3, "vertex")
+    for i, line in enumerate(triangles.lines):
+        if len(line.split()) > 3:
+            raise triangles.fault(i, "a triangle: 3 vertex ids and no more")
     return verts, triangles.table(range(len(triangles.lines)), 3, "face", kind=int)
 
 

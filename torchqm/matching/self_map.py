@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchqm.fmap.convert import p2p_to_fmap
+from torchqm.fmap.convert import nearest_used, p2p_to_fmap
 from torchqm.fmap.refine import growing_sizes, quotient_icp, upsample
 from torchqm.fmap.solve import solve_fmap
 from torchqm.matching.initial import basis_size, shared_descriptors, unit_columns_pair
@@ -21,6 +21,7 @@ __all__ = [
     "best_self_map",
     "conjugate_reflection",
     "nearest_involution",
+    "reflection_score",
     "self_map_from_halves",
     "self_maps_from_halves",
 ]
@@ -38,8 +39,7 @@ class SelfMap:
     Args:
         fmap: ``(K, K)`` refined.
         chosen: which of the candidates it grew from.
-        scores: commutativity of each candidate (0: an isometry) where they were compared; one that is close to the
-            identity counts as infinite.
+        scores: :func:`reflection_score` of each candidate where they were compared; 0 is an exact isometry.
     """
 
     fmap: SelfFMap
@@ -103,17 +103,19 @@ def conjugate_reflection(
 
 
 def best_self_map(
-    candidates: Sequence[Float[Tensor, "_K _K"]], x: PreparedShape, parameters: MatchParameters
+    candidates: Sequence[Float[Tensor, "_K _K"]],
+    x: PreparedShape,
+    parameters: MatchParameters,
+    witness: int | None = None,
 ) -> SelfMap:
-    """Grow all candidates to a hundred functions, keep the one that commutes best with the Laplacian, refine it.
-
-    A functional map of an isometry commutes with the Laplacian, and on TOSCA the candidate with the smallest commutator
-    is nearly always the one of least error. Candidates close to the identity, which commutes with everything, are out.
+    """Grow all candidates to a hundred functions, keep the one with the least :func:`reflection_score`, refine it.
 
     Args:
         candidates: functional maps of the shape to itself, of any sizes.
         x: the shape.
         parameters: of the refinement.
+        witness: a candidate that was found in another way than the rest: the mean distance between its images and those
+            of another candidate (times 0.3) is added to the score of that one. Two that agree support each other.
 
     Raises:
         ValueError: there are no candidates.
@@ -126,18 +128,39 @@ def best_self_map(
         twins = [j for j in range(number) if candidates[j].shape == candidate.shape]
         near = [j for j in twins if float((candidates[j] - candidate).norm()) < 0.05 * float(candidate.norm())]
         grown.append(grown[near[0]] if near else _grow(candidate, x, parameters, k))
-    scores = tuple(_score(fmap, x) for fmap in grown)
+    scores = [reflection_score(fmap, x) for fmap in grown]
+    if witness is not None:
+        images = [_images(fmap, x, parameters) for fmap in grown]
+        gaps = [float((image - images[witness]).norm(dim=1).mean()) for image in images]
+        scores = [score + 0.3 * gap for score, gap in zip(scores, gaps, strict=True)]
     chosen = scores.index(min(scores))
-    return SelfMap(_grow(grown[chosen], x, parameters, parameters.k_max), chosen, scores)
+    return SelfMap(_grow(grown[chosen], x, parameters, parameters.k_max), chosen, tuple(scores))
 
 
-def _score(fmap: Tensor, x: PreparedShape, most_trace: float = 0.7) -> float:
-    """Commutator norm; infinite where the even functions are so many more than the odd ones that little can move."""
-    size = fmap.shape[0]
-    if float(fmap.diagonal().sum()) > most_trace * size:
-        return float("inf")
-    evals = x.basis.evals[:size]
-    return commutator_norm(fmap, evals, evals)
+def reflection_score(fmap: Float[Tensor, "K K"], x: PreparedShape) -> float:
+    """How little a functional map looks like a reflection of the whole shape; needs no truth.
+
+    The commutator with the Laplacian, 0 for an isometry, is nearly always least for the candidate of least error (on
+    TOSCA). But what moves only a part of the shape commutes as well, the identity perfectly. Such maps have too many
+    even functions: of a reflection the even ones outnumber the odd ones by about ``l sqrt(k / pi)`` among the first k
+    (Weyl; l is the length of the axis / sqrt(area), 3 on most bodies), the trace. Half of what the trace has
+    above ``2.2 sqrt(k)``, as a share of k, is added.
+
+    Args:
+        fmap: in the first K functions of the shape.
+        x: the shape.
+    """
+    k = fmap.shape[0]
+    evals = x.basis.evals[:k]
+    excess = float(fmap.diagonal().sum()) / k - 2.2 / k**0.5
+    return commutator_norm(fmap, evals, evals) + 0.5 * max(0.0, excess)
+
+
+def _images(fmap: Tensor, x: PreparedShape, parameters: MatchParameters) -> Tensor:
+    """Where the samples go, in space."""
+    small = x.basis.truncate(fmap.shape[0])
+    partners = nearest_used(small.evecs[x.samples[: parameters.n_samples]] @ fmap.T, small.restricted(x.anchors))
+    return x.mesh.verts[x.anchors[partners]]
 
 
 def nearest_involution(matrix: Float[Tensor, "K K"]) -> Float[Tensor, "K K"]:

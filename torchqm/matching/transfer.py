@@ -36,8 +36,8 @@ class SymmetryTransfer:
         semi: the semi-quotient match that it came from.
         halves: the clustering, if that was the way.
         odd: the odd block of the map to the reference, if that was the way.
-        scores: commutativity of the candidates for the self-map at 100 functions, the best of which was kept; in the
-            order of ``parameters.self_commutativity``, then (``full_map`` only) the reference's own reflection.
+        scores: :attr:`torchqm.matching.self_map.SelfMap.scores` of the candidates: the reference's own reflection seen
+            from here (``full_map`` only), then one for each of ``parameters.self_commutativity``.
         warnings: assumptions that did not hold, with numbers.
     """
 
@@ -101,7 +101,8 @@ def transfer_symmetry(
             )
     else:
         raise ValueError(f"way={way!r}: allowed are 'clustering' and 'full_map'")
-    found = best_self_map([*self_maps_from_halves(x, sign, parameters, values_x), *more], x, parameters)
+    candidates = [*more, *self_maps_from_halves(x, sign, parameters, values_x)]
+    found = best_self_map(candidates, x, parameters, witness=0 if more else None)
     basis = x.basis.truncate(found.fmap.shape[0])
     group = SymmetryGroup.from_reflection(fmap_to_p2p(found.fmap, basis, basis, search=x.search, guide=x.search))
     moved = float(((sign != sign[group.maps[1]]) * x.mesh.vertex_areas).sum())
