@@ -122,9 +122,8 @@ def symmetries(shapes: Shapes, name: str) -> dict[str, tuple[SymmetryGroup, Symm
     """A shape's symmetry by the three ways that Figure 8 compares."""
     x, y = shapes.shape(name), shapes.shape(shapes.truth.undeformed)
     truth = shapes.truth
-    semi = match_semi_quotient(x, y, truth.group, PAPER)  # the two sets of parameters do not differ in what it uses
-    by_paper = transfer_symmetry(x, y, truth.group, truth.side, PAPER, "clustering", semi=semi)
-    ours = transfer_symmetry(x, y, truth.group, truth.side, OURS, "full_map", semi=semi)
+    by_paper = transfer_symmetry(x, y, truth.group, truth.side, PAPER, "clustering")
+    ours = transfer_symmetry(x, y, truth.group, truth.side, OURS, "full_map")
     exact = self_map_from_halves(x, torch.sign(truth.side), PAPER)
     basis = x.basis.truncate(exact.shape[0])
     return {

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from torchqm.matching import MatchParameters as MatchParameters
     from torchqm.matching import MatchResult as MatchResult
     from torchqm.matching import SymmetryResult as SymmetryResult
+    from torchqm.matching import detect_symmetry as detect_symmetry
     from torchqm.matching import find_symmetry as find_symmetry
     from torchqm.matching import match as match
     from torchqm.matching.symmetry_file import load_symmetry as load_symmetry
@@ -55,6 +56,7 @@ __all__ = [
     "SymmetryResult",
     "__version__",
     "creature",
+    "detect_symmetry",
     "even_part",
     "exact_maps",
     "find_symmetry",
@@ -80,6 +82,7 @@ _HOMES = {
         "MatchParameters",
         "MatchResult",
         "SymmetryResult",
+        "detect_symmetry",
         "find_symmetry",
         "match",
     ),

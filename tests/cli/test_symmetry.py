@@ -68,11 +68,30 @@ def test_transfer_from_a_reference(files, tmp_path):
 
 def test_no_plane_is_a_warning_with_the_residual(files, tmp_path, capsys):
     out = tmp_path / "out"
-    assert main(["symmetry", str(files / "posed.off"), "--out", str(out), "--no-picture", *FAST]) == 0
+    assert (
+        main(
+            ["symmetry", str(files / "posed.off"), "--out", str(out), "--no-picture", *FAST, "--symmetry", "extrinsic"]
+        )
+        == 0
+    )
     assert np.load(out / "symmetry.npz")["maps"].tolist() == [list(range(creature("quadruped", 1000).mesh.n_verts))]
     warnings = json.loads((out / "summary.json").read_text())["warnings"]
     assert any("no mirror plane" in text and "rms" in text for text in warnings)
     assert "torchqm: warning:" in capsys.readouterr().err
+
+
+def test_from_the_spectrum_alone(files, tmp_path, capsys):
+    """The pose has no mirror plane and there is no reference: the truth is its own exact group."""
+    out = tmp_path / "out"
+    assert main(["symmetry", str(files / "posed.off"), "--out", str(out), "--no-picture"]) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["origin"] == "detected"
+    assert summary["details"]["verdict"] == "symmetric"
+    assert "found by: detected" in capsys.readouterr().out
+    rest = creature("quadruped", 1000)
+    found = torch.from_numpy(np.load(out / "symmetry.npz")["maps"][1])
+    gap = (rest.mesh.verts[found] - rest.mesh.verts[rest.base_group[1]]).norm(dim=1)
+    assert float(gap.mean()) / rest.mesh.area**0.5 < 0.01
 
 
 def test_picture(files, tmp_path, monkeypatch):

@@ -81,6 +81,30 @@ def test_the_plane_that_belongs_to_that_of_the_other_shape():
     assert best_fitting(x, y, known_y.others[0], known_y) is known_y.others[0]
 
 
+def test_a_given_symmetry_has_the_halves_of_its_axis():
+    """The same reflection, found as a plane and handed in as a table: the same left and right but on the axis."""
+    body = creature("quadruped", 1500)
+    shape = prepare(body.mesh, 60)
+    plane = extrinsic_symmetry(shape)
+    given = given_symmetry(shape, plane.group.maps)
+    agreement = float((plane.sign * given.sign * shape.mesh.vertex_areas).sum().abs())
+    assert agreement > 0.93
+    assert given.warnings == []
+
+
+def test_rotations_and_swaps_are_no_reflections():
+    body = creature("ellipsoid", 800)
+    shape = prepare(body.mesh, 20)
+    verts = body.mesh.verts
+    turn = next(g for g in body.base_group if sum(bool((verts[:, a] * verts[g, a]).sum() < 0) for a in range(3)) == 2)
+    with pytest.raises(ValueError, match=r"keeps the orientation of the surface .*: a rotation"):
+        given_symmetry(shape, torch.stack([torch.arange(shape.n_verts), turn]))
+    swap = torch.arange(shape.n_verts)
+    swap[[3, 9]] = torch.tensor([9, 3])
+    with pytest.raises(ValueError, match=r"it moves only 0\.\d% of the area"):
+        given_symmetry(shape, torch.stack([torch.arange(shape.n_verts), swap]))
+
+
 class TestGiven:
     def test_halves_are_found(self, exact):
         known = given_symmetry(exact.x, exact.group_x.maps)

@@ -48,6 +48,8 @@ def test_plain_values():
         ({"self_commutativity": ()}, "self_commutativity=.*: one weight or more"),
         ({"time": -1e-9}, "time=-1e-09"),
         ({"growth": 1.0}, "growth=1.0"),
+        ({"seed": -1}, "seed=-1"),
+        ({"seed": 10**20}, "seed=100000000000000000000: allowed are 0 to"),
     ],
     ids=str,
 )

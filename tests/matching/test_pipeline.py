@@ -23,6 +23,7 @@ from torchqm.geometry import Mesh, MeshError, save_mesh
 from torchqm.matching import (
     Collection,
     MatchParameters,
+    detect_symmetry,
     extrinsic_symmetry,
     find_symmetry,
     given_symmetry,
@@ -202,19 +203,27 @@ class TestWithoutSymmetry:
 
     def test_no_plane_leads_there_too(self, lopsided):
         source, target = lopsided
-        found = match(source.mesh, target.mesh, parameters=FAST)
+        found = match(source.mesh, target.mesh, symmetry="extrinsic", parameters=FAST)
         assert found.labels == ("direct",)
         assert float(errors(found.maps, source, target)[0, 0]) < 1
         assert sum("no mirror plane" in text for text in found.warnings) == 2
 
     def test_find_symmetry_says_why_there_is_none(self, lopsided):
-        found = find_symmetry(lopsided[0].mesh, parameters=FAST)
+        found = find_symmetry(lopsided[0].mesh, parameters=FAST, symmetry="extrinsic")
         assert found.maps.shape == (1, lopsided[0].mesh.n_verts)
         assert found.labels == ("direct",)
         assert found.origin == "none"
         (text,) = found.warnings
         assert f"{found.details['residual']:.4f}" in text
         json.dumps(found.summary())
+
+    def test_nor_is_one_made_up_from_the_spectrum(self, lopsided):
+        found = detect_symmetry(lopsided[0].mesh, parameters=FAST)
+        assert found.maps.shape == (1, lopsided[0].mesh.n_verts)
+        assert (found.origin, found.details["verdict"]) == ("none", "asymmetric")
+        (text,) = found.warnings
+        assert "no reflection was found" in text
+        assert f"score {found.details['score']:.2f}" in text
 
     def test_groups_that_differ(self, pair):
         """The largest group that both have is the trivial one."""
@@ -340,9 +349,17 @@ class TestDoubtfulSymmetries:
     def test_both(self, doubt):
         shape, copy = blob_meshes()
         doubt.extend(["blob2", "copy"])
-        found = match(shape.mesh, copy.mesh, parameters=FAST)
+        found = match(shape.mesh, copy.mesh, symmetry="extrinsic", parameters=FAST)
         assert [found.details[side]["symmetry"] for side in ("source", "target")] == ["extrinsic", "extrinsic"]
         assert found.warnings == ["rough"]
+
+    def test_both_and_the_spectrum_knows_better(self, doubt):
+        shape, copy = blob_meshes()
+        doubt.extend(["blob2", "copy"])
+        found = match(shape.mesh, copy.mesh, parameters=FAST)
+        assert [found.details[side]["symmetry"] for side in ("source", "target")] == ["detected", "detected"]
+        assert found.warnings == []
+        assert float((found.maps[0] == exact_pair().p2p_xy).double().mean()) > 0.99
 
     @pytest.mark.parametrize("given", ["source", "target"])
     def test_a_given_symmetry_is_never_replaced(self, monkeypatch, given):
@@ -512,7 +529,7 @@ class TestInput:
             call(blob(2).mesh, blob(2).mesh, method="best")
 
     def test_unknown_symmetry(self):
-        with pytest.raises(ValueError, match="symmetry='guess': allowed are 'extrinsic', 'none' or a table"):
+        with pytest.raises(ValueError, match="symmetry='guess': allowed are auto, extrinsic, detect, none or a table"):
             match(blob(2).mesh, blob(2).mesh, symmetry="guess", parameters=FAST)
 
     def test_symmetries_that_do_not_fit(self):
@@ -560,7 +577,8 @@ def test_several_mirror_planes_and_poor_maps_are_told():
     body = creature("ellipsoid", 800)
     small = MatchParameters(k=20, k_max=30, n_descriptors=20, n_samples=300, icp_steps=2)
     known = extrinsic_symmetry(prepare(body.mesh, 30))
-    assert any("2 more mirror plane(s) fit as well" in text for text in known.warnings)
+    assert known.firm
+    assert any("2 more mirror plane(s) fit as well" in text for text in known.remarks("it"))
     other = match(creature("octopus", 800, pose=1).mesh, creature("quadruped", 800).mesh, parameters=small)
     assert any("no map is near an isometry" in text for text in other.warnings)
 

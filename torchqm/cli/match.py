@@ -34,11 +34,10 @@ have different triangulations and vertex counts; they should be (nearly) isometr
 
 _EPILOG = """\
 where the symmetry comes from:
-  The symmetry of at least one shape must be known. By default a mirror plane is looked for
-  in the reference if one is given, else in both shapes; a shape without plane gets its
-  symmetry by transfer from one that has it (sections 5 and 6.1 of the paper). So let one of
-  the two stand in a symmetric rest pose, or give such a pose of the same shape as
-  --reference. If no symmetry is found, one map comes back, with a warning.
+  By default a mirror plane is looked for in the reference if one is given, else in both
+  shapes; a shape without plane gets its symmetry by transfer from one that has it (sections
+  5 and 6.1 of the paper). If neither has one, each is asked its own spectrum. If no symmetry
+  is found, one map comes back, with a warning.
 
 files written to DIR (whole or not at all):
   match.npz     maps (G, V_source) target vertex of each source vertex; labels (direct: keeps
@@ -64,10 +63,11 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", default=Path("torchqm-match"), help="default: %(default)s")
     parser.add_argument(
         "--symmetry",
-        default="extrinsic",
-        metavar="extrinsic|none|FILE",
-        help="symmetry of the target. extrinsic (default): its mirror plane; none: use no symmetry; FILE: a "
-        "symmetry.npz, or .npy, .txt or .vts with the vertex that each vertex is mirrored to",
+        default="auto",
+        metavar="auto|extrinsic|detect|none|FILE",
+        help="symmetry of the shapes. auto (default): see below; extrinsic: mirror planes alone; detect: "
+        "spectra alone; none: use no symmetry; FILE: that of the target, a symmetry.npz, or .npy, .txt or .vts "
+        "with the vertex that each vertex is mirrored to",
     )
     parser.add_argument("--symmetry-source", type=Path, metavar="FILE", help="symmetry of the source, if it is known")
     parser.add_argument(
@@ -91,6 +91,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise UserError("--symmetry none uses no symmetry, so --symmetry-source cannot be given with it")
     with staged_folder(arguments.out, FILES) as stage, Progress() as progress:
         from torchqm.matching import match
+        from torchqm.matching.pipeline import SYMMETRIES
 
         parameters = make_parameters(arguments)
         seen: dict[Path, Mesh] = {}
@@ -98,9 +99,9 @@ def run(arguments: argparse.Namespace) -> None:
         reference = None if arguments.reference is None else read_mesh(arguments.reference, seen)
         parameters, notes = fit_parameters(parameters, seen.values(), arguments.k_max is not None)
         symmetry: Any = arguments.symmetry
-        if symmetry not in ("extrinsic", "none"):
+        if symmetry not in SYMMETRIES:
             if not Path(symmetry).exists():
-                raise UserError(f"{symmetry}: no such file; --symmetry is extrinsic, none or a file")
+                raise UserError(f"{symmetry}: no such file; --symmetry is {', '.join(SYMMETRIES)} or a file")
             symmetry, more = read_symmetry(Path(symmetry), target)
             notes += more
         symmetry_source = None

@@ -26,8 +26,8 @@ FILES = ("symmetry.npz", "summary.json", "symmetry.png")
 
 _DESCRIPTION = """\
 Find the reflection of a shape as a vertex map: from its own mirror plane if it stands in a
-symmetric pose, else by transfer from a reference, another pose of the same shape that has
-one (section 6.1 of the paper)."""
+symmetric pose, else from its spectrum (no reference, no landmarks); or by transfer from a
+reference, another pose of the same shape (section 6.1 of the paper)."""
 
 _EPILOG = """\
 files written to DIR (whole or not at all):
@@ -54,6 +54,13 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument(
         "--out", type=Path, metavar="DIR", default=Path("torchqm-symmetry"), help="default: %(default)s"
+    )
+    parser.add_argument(
+        "--symmetry",
+        choices=("auto", "extrinsic", "detect"),
+        default="auto",
+        help="without a reference. auto (default): the mirror plane if it fits firmly, else from the spectrum; "
+        "extrinsic: mirror plane alone; detect: spectrum alone",
     )
     parser.add_argument(
         "--method",
@@ -85,6 +92,7 @@ def run(arguments: argparse.Namespace) -> None:
                 parameters=parameters,
                 listener=progress.listener,
                 method=arguments.method,
+                symmetry=arguments.symmetry,
             )
         result.warnings[:0] = notes
         result.save(stage / "symmetry.npz")

@@ -1,9 +1,18 @@
 """Floor 5: the matchers: quotient, semi-quotient, symmetry transfer, and the pipeline that joins them."""
 
+from torchqm.matching.detect import Detection, detect_reflection
 from torchqm.matching.known import KnownSymmetry, extrinsic_symmetry, given_symmetry, no_symmetry, transferred_symmetry
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
 from torchqm.matching.parameters import MatchError, MatchParameters
-from torchqm.matching.pipeline import METHODS, Collection, find_symmetry, match, match_prepared
+from torchqm.matching.pipeline import (
+    METHODS,
+    SYMMETRIES,
+    Collection,
+    detect_symmetry,
+    find_symmetry,
+    match,
+    match_prepared,
+)
 from torchqm.matching.quotient import QuotientMatch, choose_halves, match_quotient, refine_by_icp, refine_by_odd_block
 from torchqm.matching.result import MatchResult, SymmetryResult
 from torchqm.matching.self_map import nearest_involution
@@ -13,7 +22,9 @@ from torchqm.matching.transfer import SymmetryTransfer, transfer_symmetry
 
 __all__ = [
     "METHODS",
+    "SYMMETRIES",
     "Collection",
+    "Detection",
     "KnownSymmetry",
     "MatchError",
     "MatchParameters",
@@ -25,6 +36,8 @@ __all__ = [
     "SymmetryResult",
     "SymmetryTransfer",
     "choose_halves",
+    "detect_reflection",
+    "detect_symmetry",
     "extrinsic_symmetry",
     "find_symmetry",
     "given_symmetry",

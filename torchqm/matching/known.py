@@ -8,18 +8,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchqm.fmap.convert import p2p_to_fmap
+from torchqm.matching.detect import detect_reflection
 from torchqm.matching.parameters import MatchError, MatchParameters
+from torchqm.matching.parity import odd_halves
+from torchqm.matching.self_map import nearest_involution
 from torchqm.matching.shape import PreparedShape
-from torchqm.matching.symmetry_file import MAX_RETURN_ERROR
+from torchqm.matching.symmetry_file import reflection_fault, return_error
 from torchqm.matching.transfer import transfer_symmetry
 from torchqm.symmetry.basis import symmetrized_basis
 from torchqm.symmetry.extrinsic import ExtrinsicReflection, find_reflections
 from torchqm.symmetry.group import SymmetryGroup
-from torchqm.symmetry.leftright import displacement, halves_of_reflection, persistence_clusters
+from torchqm.symmetry.leftright import halves_of_reflection
 
 __all__ = [
     "KnownSymmetry",
     "best_fitting",
+    "detected_symmetry",
     "extrinsic_symmetry",
     "given_symmetry",
     "no_symmetry",
@@ -38,7 +43,7 @@ class KnownSymmetry:
     Args:
         group: the group; trivial if the shape has no symmetry that is known.
         sign: ``(V,)`` -1 on one half, +1 on the other, 0 on the axis; all 0 for the trivial group.
-        origin: ``extrinsic``, ``file``, ``transfer`` or ``none``.
+        origin: ``extrinsic``, ``detected``, ``file``, ``transfer`` or ``none``.
         warnings: what is doubtful, with the numbers.
         details: numbers for the summary.
         others: further reflections that the shape has just as well, each alone; see :func:`best_fitting`.
@@ -61,6 +66,11 @@ class KnownSymmetry:
         """Whether it is known without a doubt: a better source for a transfer than a doubtful symmetry of one's own."""
         return self.known and not self.warnings
 
+    def remarks(self, name: str) -> list[str]:
+        """The warnings, and what to say of further reflections of the shape of that name."""
+        more = f"{name}: {len(self.others)} more mirror plane(s) fit as well; only one reflection is used"
+        return [*self.warnings, more] if self.others else self.warnings
+
 
 def no_symmetry(shape: PreparedShape, warnings: list[str] | None = None) -> KnownSymmetry:
     """The trivial group: the shape goes through the same code and gives one map."""
@@ -78,7 +88,7 @@ def extrinsic_symmetry(shape: PreparedShape, max_residual: float = 0.02) -> Know
     Returns:
         The reflection, with a warning if its residual is more than the triangulation explains; above ``max_residual``
         the trivial group, with a warning that gives the residual. Where several planes fit equally well they are in
-        ``others``, and a warning says how many.
+        ``others``.
 
     References:
         Paper, sections 6.2 and 7.
@@ -86,10 +96,6 @@ def extrinsic_symmetry(shape: PreparedShape, max_residual: float = 0.02) -> Know
     found, *more = find_reflections(shape.mesh)
     if found.residual <= max_residual:
         first, *others = (_reflection(shape, plane) for plane in (found, *more) if plane.residual <= max_residual)
-        if others:
-            first.warnings.append(
-                f"{shape.mesh.label}: {len(others)} more mirror plane(s) fit as well; only one reflection is used"
-            )
         return replace(first, others=tuple(others))
     text = f"{shape.mesh.label}: no mirror plane: the best one leaves a residual above {max_residual:g}"
     numbers, details = _numbers(found)
@@ -152,12 +158,28 @@ def best_fitting(x: PreparedShape, y: PreparedShape, known_x: KnownSymmetry, kno
     return replace(best, warnings=known_x.warnings, details=details)
 
 
+def detected_symmetry(shape: PreparedShape, parameters: MatchParameters) -> KnownSymmetry:
+    """The reflection of a shape from its own spectrum (:func:`torchqm.matching.detect.detect_reflection`).
+
+    Returns:
+        The reflection, with a warning if the verdict is ``ambiguous``; the trivial group, with a warning, if it is
+        ``asymmetric``. The verdict and its numbers are in ``details``.
+    """
+    found = detect_reflection(shape, parameters)
+    details: dict[str, Any] = {"verdict": found.verdict, "candidates": found.candidates, **found.parts}
+    origin = "detected" if found.group.order > 1 else "none"
+    return KnownSymmetry(found.group, found.sign, origin, found.warnings, details)
+
+
 def given_symmetry(shape: PreparedShape, maps: Tensor, origin: str = "file") -> KnownSymmetry:
-    """A symmetry handed in as a table of vertex maps, row 0 the identity; left and right are found by clustering.
+    """A symmetry handed in as a table of vertex maps, row 0 the identity; left and right from its odd functions.
 
     Raises:
-        MatchError: wrong length or ids, row 0 is not the identity, more than one reflection, or a map that is not an
-            involution: applied twice, it must bring each point back to within a tenth of sqrt(area) on average.
+        MatchError: wrong length or ids, row 0 is not the identity, more than one reflection, or a map that is no
+            reflection (:func:`torchqm.matching.symmetry_file.reflection_fault`).
+
+    References:
+        Paper, section 6.1; :func:`torchqm.matching.parity.odd_halves` instead of the clustering, which can fail.
     """
     if maps.ndim != 2 or maps.dtype != torch.int64:
         raise MatchError(
@@ -176,17 +198,14 @@ def given_symmetry(shape: PreparedShape, maps: Tensor, origin: str = "file") -> 
             f"{shape.mesh.label}: the symmetry has {group.order} elements; dense maps are extracted for one reflection "
             "(2 elements) so far"
         )
-    verts = shape.mesh.verts
-    back = group.maps[1][group.maps[1]]
-    error = float(((verts - verts[back]).norm(dim=1) * shape.basis.mass).sum())
-    if error > MAX_RETURN_ERROR:
-        raise MatchError(
-            f"{shape.mesh.label}: row 1 of the symmetry is no reflection: applied twice it moves points by {error:.3f} "
-            f"sqrt(area) on average (0 is exact, {MAX_RETURN_ERROR:g} is allowed)"
-        )
-    halves = persistence_clusters(shape.mesh, displacement(shape.mesh, group.maps[1], "extrinsic"))
-    warnings = [f"{shape.mesh.label}: {halves.warning}"] if halves.warning else []
-    return KnownSymmetry(group, halves.sign, origin, warnings, {"involution_error": error})
+    reflection = group.maps[1]
+    fault = reflection_fault(shape.mesh, reflection)
+    if fault is not None:
+        raise MatchError(f"{shape.mesh.label}: row 1 of the symmetry is no reflection: {fault}")
+    small = shape.basis.truncate(min(60, shape.basis.k))
+    halves = odd_halves(shape.mesh, small, nearest_involution(p2p_to_fmap(reflection, small, small)))
+    sign = torch.where(halves * halves[reflection] < 0, halves, 0.0)
+    return KnownSymmetry(group, sign, origin, [], {"involution_error": return_error(shape.mesh, reflection)})
 
 
 def transferred_symmetry(

@@ -75,7 +75,10 @@ def solve_odd(
             "take a larger k"
         )
     if not odd_x.k or not odd_y.k:
-        raise MatchError(f"{odd_x.k} and {odd_y.k} odd functions: none can be matched; take a larger k")
+        raise MatchError(
+            f"{mesh_x.label} has {odd_x.k} odd functions and {mesh_y.label} has {odd_y.k} among the first "
+            f"{even_x.k + odd_x.k} and {even_y.k + odd_y.k}: none can be matched; take a larger k"
+        )
     pairs = function_pairs(n)
     images = even_y.evecs[:, : fmap_even.shape[0]] @ fmap_even[:, :n]
     f, g = unit_columns_pair(

@@ -73,6 +73,8 @@ class MatchParameters:
             raise ValueError(f"n_descriptors={self.n_descriptors}: the wave kernel signature needs at least 2 energies")
         if self.semi_width is not None and self.semi_width <= 0:
             raise ValueError(f"semi_width={self.semi_width}: must be positive, or None for the iteration as printed")
+        if not 0 <= self.seed < 2**63:
+            raise ValueError(f"seed={self.seed}: allowed are 0 to {2**63 - 1}")
         if self.growth <= 1:
             raise ValueError(f"growth={self.growth}: the basis must grow, by a ratio above 1")
 

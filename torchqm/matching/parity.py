@@ -1,7 +1,7 @@
 """Which eigenfunctions a reflection leaves and which it turns over, and where on the shape it turns them over."""
 
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
 
 import torch
 from jaxtyping import Float
@@ -64,7 +64,7 @@ def parity_patterns(
     gram = seen @ seen.T
     turn = torch.eye(n_functions, dtype=gram.dtype)
     starts = [0, *((evals.diff() >= rtol * evals[1:]).nonzero().flatten() + 1).tolist(), n_functions]
-    for start, stop in zip(starts[:-1], starts[1:], strict=True):
+    for start, stop in pairwise(starts):
         turn[start:stop, start:stop] = torch.linalg.eigh(gram[start:stop, start:stop])[1]
     functions = basis.evecs[:, 1 : n_functions + 1] @ turn
     energy = (turn.T @ gram @ turn).diagonal()

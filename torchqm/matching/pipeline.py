@@ -17,6 +17,7 @@ from torchqm.matching.initial import basis_size
 from torchqm.matching.known import (
     KnownSymmetry,
     best_fitting,
+    detected_symmetry,
     extrinsic_symmetry,
     given_symmetry,
     no_symmetry,
@@ -37,22 +38,25 @@ from torchqm.matching.semi_quotient import match_semi_quotient
 from torchqm.matching.shape import N_ANCHORS, PreparedShape, prepare
 from torchqm.matching.steps import StepListener, Steps
 
-__all__ = ["METHODS", "Collection", "find_symmetry", "match", "match_prepared"]
+__all__ = ["METHODS", "SYMMETRIES", "Collection", "detect_symmetry", "find_symmetry", "match", "match_prepared"]
 
 POOR_SCORE = 0.15
 """Commutativity score above which a map is called poor; true maps of TOSCA have 0.03 (wolf) to 0.13 (cat)."""
 
 METHODS = ("quotient", "paper", "semi")
 
+SYMMETRIES = ("auto", "extrinsic", "detect", "none")
+"""Ways to come to a shape's symmetry; a table of vertex maps is another."""
+
 # Expected seconds per step and 1000 vertices, for the share of work done; measured once, only their ratios matter.
-_COST = {"eigenpairs": 0.55, "plane": 0.5, "transfer": 1.5, "quotient": 0.35, "maps": 0.4}
+_COST = {"eigenpairs": 0.3, "plane": 0.025, "detect": 0.4, "transfer": 0.16, "quotient": 0.045, "maps": 0.07}
 
 
 def match(
     source: Mesh | str | Path,
     target: Mesh | str | Path,
     *,
-    symmetry: str | Tensor | np.ndarray = "extrinsic",
+    symmetry: str | Tensor | np.ndarray = "auto",
     symmetry_source: Tensor | np.ndarray | None = None,
     reference: Mesh | str | Path | None = None,
     method: str = "quotient",
@@ -61,14 +65,16 @@ def match(
 ) -> MatchResult:
     """All the equally good dense maps from one shape to another.
 
-    The symmetry of at least one shape must be known. With ``symmetry='extrinsic'`` a mirror plane is looked for in
-    the reference if there is one, else in both shapes; a shape without plane gets its symmetry by transfer from one
-    that has it (sections 5 and 6.1). Then the two are matched in the quotient (section 4).
+    First the symmetry of both must be known. With ``symmetry='auto'`` a mirror plane is looked for in the reference if
+    there is one, else in both shapes; a shape without plane gets its symmetry by transfer from one that has it
+    (sections 5 and 6.1), and if none has, each is asked its own spectrum
+    (:func:`torchqm.matching.detect.detect_reflection`). Then the two are matched in the quotient (section 4).
 
     Args:
         source: a mesh or its file.
         target: a mesh or its file.
-        symmetry: ``extrinsic``, ``none``, or the target's symmetry as ``(G, V_target)`` vertex maps (tensor or array).
+        symmetry: ``auto``; ``extrinsic`` (mirror planes alone); ``detect`` (spectra alone); ``none``; or the target's
+            symmetry as ``(G, V_target)`` vertex maps (tensor or array).
         symmetry_source: the source's symmetry as vertex maps, if known; else it is found.
         reference: an undeformed pose of the same shape, whose mirror plane gives both shapes their symmetry.
         method: ``quotient`` (default; what measured best), ``paper`` (sections 4 to 7 with its parameters) or ``semi``
@@ -98,24 +104,29 @@ def find_symmetry(
     parameters: MatchParameters | None = None,
     listener: StepListener | None = None,
     method: str = "quotient",
+    symmetry: str = "auto",
 ) -> SymmetryResult:
-    """The reflection of a shape: from its own mirror plane, or transferred from an undeformed reference.
+    """The reflection of a shape: from its own mirror plane or spectrum, or transferred from an undeformed reference.
 
     Args:
         mesh: the shape.
-        reference: another pose of it that has a mirror plane; without it the shape's own plane is looked for.
+        reference: another pose of it that has a mirror plane.
         parameters: of the matching.
         listener: told of each step.
         method: whose way of transfer: ``quotient`` or ``paper``.
+        symmetry: without a reference: ``auto`` (the mirror plane if it fits firmly, else the spectrum), ``extrinsic``
+            (mirror plane alone) or ``detect`` (spectrum alone).
 
     Returns:
-        The group; trivial, with a warning that gives the residual, if no plane was found.
+        The group; trivial, with a warning that gives the numbers, if no reflection was found.
     """
+    if symmetry not in SYMMETRIES[:3]:
+        raise ValueError(f"symmetry={symmetry!r}: allowed are {', '.join(SYMMETRIES[:3])}")
     collection = Collection(reference, method, parameters, listener)
     mesh = collection.load(mesh)
     collection.steps.total = collection.expected_work(mesh, match=False)
     shape = collection.shape(mesh)
-    known = collection.symmetry(shape)
+    known = collection.symmetry(shape, symmetry)
     scores = [commutativity_score(m, shape.basis, shape.basis) for m in known.group.maps]
     agreement = [orientation_agreement(shape.mesh, shape.mesh, m) for m in known.group.maps]
     labels = [_label(a) if shape.oriented else "unknown" for a in agreement]
@@ -124,11 +135,28 @@ def find_symmetry(
         ("direct", *labels[1:]),
         torch.tensor(scores, dtype=torch.float64),
         known.origin,
-        [*shape.warnings, *known.warnings],
+        [*shape.warnings, *known.remarks(shape.mesh.label)],
         collection.parameters.as_dict(),
         dict(collection.steps.seconds),
         {**known.details, "orientation": agreement},
     )
+
+
+def detect_symmetry(
+    mesh: Mesh | str | Path, *, parameters: MatchParameters | None = None, listener: StepListener | None = None
+) -> SymmetryResult:
+    """The reflection of a shape from its own spectrum: no reference, no mirror plane, no landmarks.
+
+    Args:
+        mesh: the shape.
+        parameters: of the matching.
+        listener: told of each step.
+
+    Returns:
+        The group, trivial if none was found; ``details`` has the verdict (``symmetric``, ``ambiguous``,
+        ``asymmetric``) and the numbers behind it, see :class:`torchqm.matching.detect.Detection`.
+    """
+    return find_symmetry(mesh, parameters=parameters, listener=listener, symmetry="detect")
 
 
 class Collection:
@@ -156,7 +184,7 @@ class Collection:
         self.steps = Steps(listener=listener)
         self.way = "full_map" if method == "quotient" else "clustering"
         self._shapes: dict[int, tuple[Mesh, PreparedShape]] = {}
-        self._symmetries: dict[int, tuple[PreparedShape, KnownSymmetry]] = {}
+        self._symmetries: dict[tuple[int, str], tuple[PreparedShape, KnownSymmetry]] = {}
         self._files: dict[Path, Mesh] = {}
         self._reference = None if reference is None else self.load(reference)
 
@@ -184,17 +212,33 @@ class Collection:
             self._shapes[id(mesh)] = (mesh, prepared)  # the mesh is kept so that its id stays its own
         return self._shapes[id(mesh)][1]
 
-    def symmetry(self, shape: PreparedShape) -> KnownSymmetry:
-        """The shape's symmetry: from the reference if there is one, else from its own mirror plane."""
-        if id(shape) not in self._symmetries:
-            if self._reference is None or self.shape(self._reference) is shape:
-                with self.steps(f"mirror plane of {shape.mesh.name}", _COST["plane"] * shape.n_verts / 1000):
-                    known = extrinsic_symmetry(shape)
-            else:
+    def symmetry(self, shape: PreparedShape, how: str = "extrinsic") -> KnownSymmetry:
+        """The shape's symmetry: from the reference if there is one, else from itself.
+
+        Args:
+            shape: the shape.
+            how: without a reference: ``extrinsic`` (its mirror plane), ``detect`` (its spectrum), or ``auto``: the
+                plane if it fits firmly, else what its spectrum says, else the plane that fits roughly.
+        """
+        key = (id(shape), how)
+        if key not in self._symmetries:
+            cost = shape.n_verts / 1000
+            if self._reference is not None and self.shape(self._reference) is not shape:
                 reference = self.shape(self._reference)
-                known = self.transfer(shape, reference, self.symmetry(reference))
-            self._symmetries[id(shape)] = (shape, known)  # kept like the meshes above
-        return self._symmetries[id(shape)][1]
+                known = self.transfer(shape, reference, self.symmetry(reference, how))
+            elif how == "detect":
+                with self.steps(f"symmetry of {shape.mesh.name} from its spectrum", _COST["detect"] * cost):
+                    known = detected_symmetry(shape, self.parameters)
+            elif how == "auto":
+                known = self.symmetry(shape)
+                if not known.firm:
+                    detected = self.symmetry(shape, "detect")
+                    known = detected if detected.firm or not known.known else known
+            else:
+                with self.steps(f"mirror plane of {shape.mesh.name}", _COST["plane"] * cost):
+                    known = extrinsic_symmetry(shape)
+            self._symmetries[key] = (shape, known)  # kept like the meshes above
+        return self._symmetries[key][1]
 
     def transfer(self, shape: PreparedShape, reference: PreparedShape, known: KnownSymmetry) -> KnownSymmetry:
         """A shape's symmetry by transfer from another; trivial if that has none."""
@@ -207,7 +251,7 @@ class Collection:
         self,
         source: Mesh | str | Path | PreparedShape,
         target: Mesh | str | Path | PreparedShape,
-        symmetry: str | Tensor | np.ndarray = "extrinsic",
+        symmetry: str | Tensor | np.ndarray = "auto",
         symmetry_source: Tensor | np.ndarray | None = None,
     ) -> MatchResult:
         """Match two poses; arguments and result as in :func:`match`."""
@@ -236,14 +280,17 @@ class Collection:
                 raise ValueError("symmetry='none' asks for no symmetry at all, but symmetry_source was given")
             return no_symmetry(x), no_symmetry(y)
         known_x = None if symmetry_source is None else given_symmetry(x, torch.as_tensor(symmetry_source))
-        if isinstance(symmetry, Tensor):
-            known_y = given_symmetry(y, symmetry)
-        elif symmetry == "extrinsic":
-            known_y = self.symmetry(y)
-        else:
-            raise ValueError(f"symmetry={symmetry!r}: allowed are 'extrinsic', 'none' or a table of vertex maps")
+        how = "extrinsic" if isinstance(symmetry, Tensor) else symmetry
+        if how not in SYMMETRIES:
+            raise ValueError(f"symmetry={how!r}: allowed are {', '.join(SYMMETRIES)} or a table of vertex maps")
+        first = "extrinsic" if how == "auto" else how
+        known_y = given_symmetry(y, symmetry) if isinstance(symmetry, Tensor) else self.symmetry(y, first)
         if known_x is None and (isinstance(symmetry, str) or self.method != "semi"):
-            known_x = self.symmetry(x)
+            known_x = self.symmetry(x, first)
+        if how == "auto" and known_x is not None and not (known_x.firm or known_y.firm):
+            # Nothing to rely on; a transfer from a shape with a firm plane would be quicker, and as good.
+            known_x = self.symmetry(x, "auto") if symmetry_source is None else known_x
+            known_y = self.symmetry(y, "auto")
         if known_x is None or _gives_way(known_x, known_y):
             known_x = self.transfer(x, y, known_y)
         elif _gives_way(known_y, known_x):
@@ -286,7 +333,8 @@ def match_prepared(
     parameters = parameters or MatchParameters()
     steps = steps or Steps()
     earlier = dict(steps.seconds)
-    warnings = list(dict.fromkeys([*x.warnings, *y.warnings, *known_x.warnings, *known_y.warnings]))
+    remarks = [*known_x.remarks(x.mesh.label), *known_y.remarks(y.mesh.label)]
+    warnings = list(dict.fromkeys([*x.warnings, *y.warnings, *remarks]))
     if known_x.group.order != known_y.group.order:
         warnings.append(
             f"the groups differ ({known_x.group.order} and {known_y.group.order} elements): "
@@ -311,7 +359,7 @@ def match_prepared(
     if method == "semi":
         with steps("semi-quotient matching", _COST["quotient"] * work):
             semi = match_semi_quotient(x, y, known_y.group, parameters)
-            even, p2p, fmap = semi.fmap, semi.orbit_map, None
+            even, p2p, fmap = semi.even, semi.orbit_map, None
             if known_y.known:
                 p2p = choose_halves(p2p, known_y.group, known_x.sign, known_y.sign)
     else:
@@ -379,10 +427,12 @@ def match_prepared(
 def _gives_way(mine: KnownSymmetry, other: KnownSymmetry) -> bool:
     """Whether a transfer from the other shape is better than what is known here.
 
-    A doubtful plane of one's own (a pose that is nearly symmetric) gives way to a firm symmetry of the other shape;
-    what the user or the reference gave does not.
+    A doubtful reflection of one's own (a pose that is nearly symmetric) gives way to a firm symmetry of the other
+    shape; what the user or the reference gave does not.
     """
-    return (other.known and not mine.known) or (other.firm and not mine.firm and mine.origin == "extrinsic")
+    return (other.known and not mine.known) or (
+        other.firm and not mine.firm and mine.origin in ("extrinsic", "detected")
+    )
 
 
 def _spectrum_warning(shape: PreparedShape, k: int, rtol: float = 1e-3, most: float = 0.2) -> str | None:

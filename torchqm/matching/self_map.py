@@ -13,13 +13,14 @@ from torchqm.fmap.solve import solve_fmap
 from torchqm.matching.initial import basis_size, shared_descriptors, unit_columns_pair
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.quality import commutator_norm
-from torchqm.matching.shape import PreparedShape
+from torchqm.matching.shape import N_ANCHORS, PreparedShape
 from torchqm.symmetry.group import SymmetryGroup
 
 __all__ = [
     "SelfMap",
     "best_self_map",
     "conjugate_reflection",
+    "grow_self_map",
     "nearest_involution",
     "reflection_score",
     "self_map_from_halves",
@@ -127,14 +128,14 @@ def best_self_map(
     for number, candidate in enumerate(candidates):
         twins = [j for j in range(number) if candidates[j].shape == candidate.shape]
         near = [j for j in twins if float((candidates[j] - candidate).norm()) < 0.05 * float(candidate.norm())]
-        grown.append(grown[near[0]] if near else _grow(candidate, x, parameters, k))
+        grown.append(grown[near[0]] if near else grow_self_map(candidate, x, parameters, k))
     scores = [reflection_score(fmap, x) for fmap in grown]
     if witness is not None:
         images = [_images(fmap, x, parameters) for fmap in grown]
         gaps = [float((image - images[witness]).norm(dim=1).mean()) for image in images]
         scores = [score + 0.3 * gap for score, gap in zip(scores, gaps, strict=True)]
     chosen = scores.index(min(scores))
-    return SelfMap(_grow(grown[chosen], x, parameters, parameters.k_max), chosen, tuple(scores))
+    return SelfMap(grow_self_map(grown[chosen], x, parameters, parameters.k_max), chosen, tuple(scores))
 
 
 def reflection_score(fmap: Float[Tensor, "K K"], x: PreparedShape) -> float:
@@ -174,12 +175,22 @@ def nearest_involution(matrix: Float[Tensor, "K K"]) -> Float[Tensor, "K K"]:
     return (vectors * torch.where(weights < 0, -1.0, 1.0)) @ vectors.T
 
 
-def _grow(fmap: Tensor, x: PreparedShape, parameters: MatchParameters, k: int) -> Tensor:
-    """Refine a self-map up to ``k`` functions by the way that ``parameters.refinement`` names."""
-    k = min(k, x.basis.k)
+def grow_self_map(
+    fmap: Float[Tensor, "K K"], x: PreparedShape, parameters: MatchParameters, k: int, n_anchors: int = N_ANCHORS
+) -> Float[Tensor, "K2 K2"]:
+    """Refine a self-map up to ``k`` functions by the way that ``parameters.refinement`` names.
+
+    Args:
+        fmap: in the first K functions.
+        x: the shape.
+        parameters: ``refinement``, ``growth`` and ``n_samples`` are used.
+        k: functions to reach; at most ``k_max`` and what the basis holds.
+        n_anchors: vertices among which partners are looked for.
+    """
+    k = min(k, parameters.k_max, x.basis.k)
     if parameters.refinement == "none" or k <= fmap.shape[0]:
         return fmap
-    samples, among = x.samples[: parameters.n_samples], x.basis.restricted(x.anchors)
+    samples, among = x.samples[: parameters.n_samples], x.basis.restricted(x.samples[:n_anchors])
     if parameters.refinement == "icp":  # section 7.4: five steps at 100, three at 300
         return upsample(fmap, x.basis, among, samples, [k], steps=5 if k <= K_CHOICE else 3)
     for size in growing_sizes(fmap.shape[0], k, parameters.growth):

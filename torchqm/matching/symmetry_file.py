@@ -2,7 +2,7 @@
 
 import re
 import zipfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +10,11 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from torchqm.geometry.check import orient_faces
 from torchqm.geometry.mesh import Mesh
+from torchqm.matching.quality import orientation_agreement
 
-__all__ = ["MAX_RETURN_ERROR", "SymmetryFile", "SymmetryFileError", "load_symmetry", "return_error"]
+__all__ = ["MAX_RETURN_ERROR", "SymmetryFile", "SymmetryFileError", "load_symmetry", "reflection_fault", "return_error"]
 
 MAX_RETURN_ERROR = 0.1
 """A reflection applied twice must bring points back to within this on average, in units of sqrt(area)."""
@@ -48,6 +50,36 @@ def return_error(mesh: Mesh, reflection: Int[Tensor, " V"]) -> float:
     unit = mesh.normalized()  # area**1.5 of the file's units may be no double
     moved = (unit.verts - unit.verts[reflection[reflection]]).norm(dim=1)
     return float((moved * unit.vertex_areas).sum())
+
+
+def reflection_fault(mesh: Mesh, reflection: Int[Tensor, " V"]) -> str | None:
+    """What speaks against a vertex map being the reflection of a shape, with the numbers; None if nothing does.
+
+    Applied twice it must bring points back (:data:`MAX_RETURN_ERROR`), it must move a third of the area at least by
+    more than 0.02 sqrt(area), and on an orientable surface it must turn the orientation over: what keeps it is a
+    rotation, which has no left and right.
+
+    Args:
+        mesh: the shape, any scale.
+        reflection: ``(V,)`` vertex map of it.
+    """
+    error = return_error(mesh, reflection)
+    if not error <= MAX_RETURN_ERROR:
+        return (
+            f"applied twice it moves points by {error:.3f} sqrt(area) on average "
+            f"(0 is exact, {MAX_RETURN_ERROR:g} is allowed)"
+        )
+    unit = mesh.normalized()
+    moved = float(unit.vertex_areas[(unit.verts - unit.verts[reflection]).norm(dim=1) > 0.02].sum())
+    if moved < 1 / 3:
+        return f"it moves only {moved:.1%} of the area (by more than 0.02 sqrt(area)); a reflection moves nearly all"
+    faces = orient_faces(unit)
+    if faces is not None:
+        oriented = replace(unit, faces=faces)
+        agreement = orientation_agreement(oriented, oriented, reflection)
+        if agreement > 0.3:
+            return f"it keeps the orientation of the surface ({agreement:+.2f}, a reflection has -1): a rotation"
+    return None
 
 
 def load_symmetry(path: str | Path, mesh: Mesh) -> SymmetryFile:
@@ -201,13 +233,11 @@ def _check_row(path: Path, mesh: Mesh, row: Int[Tensor, " V"], number: int, orde
     repeated = n - int(row.unique().numel())
     if order > 2:  # a rotation need not undo itself; the group's own residuals judge it
         return []
-    error = return_error(mesh, row)
-    if not error <= MAX_RETURN_ERROR:
+    fault = reflection_fault(mesh, row)
+    if fault is not None:
         kind = f"no permutation ({repeated} of {n} ids repeat) and " if repeated else "a permutation, but "
-        raise SymmetryFileError(
-            f"{where}is {kind}no reflection: applied twice it moves points by {error:.3f} sqrt(area) on average "
-            f"(0 is exact, {MAX_RETURN_ERROR:g} is allowed)"
-        )
+        raise SymmetryFileError(f"{where}is {kind}no reflection: {fault}")
+    error = return_error(mesh, row)
     if repeated:
         return [
             f"{where}is no permutation ({repeated} of {n} ids repeat): taken as a nearest-vertex map; applied twice it "
