@@ -307,6 +307,9 @@ class TestMethodsOnAnExactPair:
         assert torch.equal(both.symmetry_source, shape.group.maps)
         assert not any("plane" in step or "transfer" in step for step in both.seconds)
         semi = match(shape.mesh, copy.mesh, symmetry=copy.group.maps, method="semi", parameters=PAPER)
+        even = semi.fmap_even  # the block between symmetric functions, not the map from all functions
+        torch.testing.assert_close(even @ even.T, torch.eye(len(even), dtype=torch.float64))
+        assert even.shape[0] == even.shape[1] < PAPER.k
         assert float((semi.maps == wanted).double().mean()) > 0.95
         assert semi.details["source"]["symmetry"] == "transfer"
 
