@@ -7,7 +7,7 @@ from references.pairs import FAST, K
 from torchqm.data.synthetic import creature, exact_maps
 from torchqm.fmap import p2p_to_fmap
 from torchqm.matching import MatchParameters, detect_reflection, prepare
-from torchqm.matching.detect import orientation_reversal
+from torchqm.matching.detect import _OrientationAgreement
 
 
 def test_the_exact_reflection_of_a_blob(exact):
@@ -59,4 +59,4 @@ def test_reflections_turn_the_orientation_over_and_rotations_keep_it():
         signs = [float(torch.sign((verts[:, a] * verts[element, a]).sum())) for a in range(3)]
         direct = signs[0] * signs[1] * signs[2]
         fmap = p2p_to_fmap(element, shape.basis, shape.basis)
-        assert orientation_reversal(fmap, shape) == pytest.approx(direct, abs=0.05)
+        assert _OrientationAgreement(shape)(fmap) == pytest.approx(direct, abs=0.05)

@@ -154,4 +154,4 @@ def test_transferred(exact, known, way):
     assert found.details["reference"] == "blob2"
     assert found.details["way"] == way
     numbers = {"full_map": {"residual_direct", "residual_mirrored"}, "clustering": {"persistence", "margin", "balance"}}
-    assert set(found.details) == {"reference", "way"} | numbers[way]
+    assert set(found.details) == {"reference", "way", "self_map_scores"} | numbers[way]

@@ -17,6 +17,7 @@ from references.pairs import FAST, blob_meshes, exact_pair, mirrored, posed, reo
 from references.shapes import blob, prism, rotation
 
 import torchqm.matching.pipeline as module
+import torchqm.matching.prepared as prepared
 from torchqm.data.synthetic import creature, exact_maps, symmetry_truth
 from torchqm.fmap import fmap_to_p2p
 from torchqm.geometry import Mesh, MeshError, save_mesh
@@ -418,7 +419,7 @@ class TestEqualEigenvalues:
 class TestOrientation:
     def test_what_cannot_be_told_apart_is_unknown(self, monkeypatch):
         shape, copy = blob_meshes()
-        monkeypatch.setattr(module, "orientation_agreement", lambda *_: 0.2)
+        monkeypatch.setattr(prepared, "orientation_agreement", lambda *_: 0.2)
         found = match(shape.mesh, copy.mesh, parameters=FAST)
         assert found.labels == ("unknown", "unknown")
         (text,) = found.warnings

@@ -61,14 +61,6 @@ def test_through_the_full_map_left_stays_left(either):
     assert float((found.sign[~off_axis] == 0).double().mean()) > 0.9
 
 
-def test_a_semi_quotient_match_that_is_there_is_used(exact, monkeypatch):
-    wanted = transfer(exact)
-    monkeypatch.setattr(module, "match_semi_quotient", None)
-    found = transfer(exact, semi=wanted.semi)
-    assert found.semi is wanted.semi
-    assert torch.equal(found.group.maps, wanted.group.maps)
-
-
 def test_refusals(exact):
     with pytest.raises(ValueError, match="way='guess': allowed are 'clustering' and 'full_map'"):
         transfer(exact, "guess")

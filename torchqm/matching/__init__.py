@@ -11,8 +11,8 @@ from torchqm.matching.pipeline import (
     detect_symmetry,
     find_symmetry,
     match,
-    match_prepared,
 )
+from torchqm.matching.prepared import match_prepared
 from torchqm.matching.quotient import QuotientMatch, choose_halves, match_quotient, refine_by_icp, refine_by_odd_block
 from torchqm.matching.result import MatchResult, SymmetryResult
 from torchqm.matching.self_map import nearest_involution

@@ -18,7 +18,7 @@ from torchqm.matching.shape import PreparedShape
 from torchqm.symmetry.group import SymmetryGroup
 from torchqm.symmetry.orientation import function_pairs, orientation_coefficients
 
-__all__ = ["Detection", "detect_reflection", "orientation_reversal"]
+__all__ = ["Detection", "detect_reflection"]
 
 SYMMETRIC, ASYMMETRIC = (0.15, 0.12), (0.22, 0.145)
 """Score of the best candidate, and commutativity of its vertex map, up to which it is a symmetry; and above which it is
@@ -47,7 +47,7 @@ class Detection:
             distance between the image of a delta and the delta that it is taken for), ``involution`` (mean distance
             between x and S(S(x)) / sqrt(area)), ``moved`` (share of the area that changes sides), ``orientation`` (-1
             where S turns over every triangle).
-        candidates: how many maps were compared in the last round.
+        candidates: how many maps were compared.
         warnings: what is doubtful, with the numbers.
     """
 
@@ -101,10 +101,10 @@ def detect_reflection(
     many = parameters.changed(refinement="upsample")
     rough = [grow_self_map(fmap, x, few, FIRST, n_anchors=1500) for fmap in patterns.fmaps]
     rough.sort(key=lambda fmap: reflection_score(fmap, x))
-    turning = _Orientation(x) if x.oriented else None
+    orientation = _OrientationAgreement(x) if x.oriented else None
 
     def judged(fmap: Tensor) -> _Candidate:
-        against = 0.0 if turning is None else 0.5 * max(0.0, 0.5 + turning.agreement(fmap))
+        against = 0.0 if orientation is None else 0.5 * max(0.0, 0.5 + orientation(fmap))
         return _Candidate(fmap, reflection_score(fmap, x) + against)
 
     pool: list[_Candidate] = []
@@ -143,8 +143,8 @@ def _different(candidates: Sequence[_Candidate], n: int, least: float = 0.3) -> 
     return kept
 
 
-class _Orientation:
-    """``omega`` of pairs of low functions, computed once, to be compared with that of their images.
+class _OrientationAgreement:
+    """``omega`` of pairs of low functions, computed once, to be compared with that of their images under self-maps.
 
     On every n-th triangle only: what is compared is smooth, and only its sign and rough size matter.
     """
@@ -159,24 +159,12 @@ class _Orientation:
     def _omega(self, values: Tensor) -> Tensor:
         return orientation_coefficients(self.mesh, values, self.pairs, self.x.basis.evecs[:, : self.k])
 
-    def agreement(self, fmap: Tensor) -> float:
-        """Cosine between the images of ``omega(f, g)`` and ``omega(C f, C g)``: 1 direct, -1 mirrored."""
+    def __call__(self, fmap: Tensor) -> float:
+        """Cosine between the images of ``omega(f, g)`` and ``omega(C f, C g)``; 1: a rotation, -1: a reflection."""
         k = min(self.k, fmap.shape[0])
         images = self._omega(self.x.basis.evecs[:, : fmap.shape[0]] @ fmap[:, : self.n])[:k]
         wanted = fmap[:k, :k] @ self.own[:k]
         return float((wanted * images).sum() / (wanted.norm() * images.norm()).clamp_min(1e-300))
-
-
-def orientation_reversal(fmap: Float[Tensor, "K K"], x: PreparedShape) -> float:
-    """Cosine between ``C omega(f, g)`` and ``omega(C f, C g)`` over pairs of low functions, of a self-map.
-
-    1 for a map that keeps the orientation of the surface (a rotation), -1 for one that turns it over (a reflection).
-
-    Args:
-        fmap: in the first K functions of x.
-        x: an oriented shape.
-    """
-    return _Orientation(x).agreement(fmap)
 
 
 def _judge(x: PreparedShape, pool: list[_Candidate], parameters: MatchParameters) -> Detection:

@@ -216,7 +216,7 @@ def transferred_symmetry(
     Arguments as in :func:`torchqm.matching.transfer.transfer_symmetry`, whose numbers go into ``details``.
     """
     moved = transfer_symmetry(shape, reference, known.group, known.sign, parameters, way)
-    details: dict[str, Any] = {"reference": reference.mesh.label, "way": way}
+    details: dict[str, Any] = {"reference": reference.mesh.label, "way": way, "self_map_scores": list(moved.scores)}
     if moved.odd is not None:
         details |= {"residual_direct": moved.odd.residual_direct, "residual_mirrored": moved.odd.residual_mirrored}
     if moved.halves is not None:

@@ -2,18 +2,14 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchqm.fmap.convert import p2p_to_fmap
-from torchqm.fmap.refine import correspondence_fmap
 from torchqm.geometry.check import check_mesh
 from torchqm.geometry.io import load_mesh
 from torchqm.geometry.mesh import Mesh
-from torchqm.matching.initial import basis_size
 from torchqm.matching.known import (
     KnownSymmetry,
     best_fitting,
@@ -24,32 +20,18 @@ from torchqm.matching.known import (
     transferred_symmetry,
 )
 from torchqm.matching.parameters import MatchParameters
+from torchqm.matching.prepared import COST, match_prepared, orientation_label
 from torchqm.matching.quality import commutativity_score, orientation_agreement
-from torchqm.matching.quotient import (
-    choose_halves,
-    dense_map,
-    match_quotient,
-    refine_by_icp,
-    refine_by_odd_block,
-    refine_fmap,
-)
 from torchqm.matching.result import MatchResult, SymmetryResult
-from torchqm.matching.semi_quotient import match_semi_quotient
 from torchqm.matching.shape import N_ANCHORS, PreparedShape, prepare
 from torchqm.matching.steps import StepListener, Steps
 
-__all__ = ["METHODS", "SYMMETRIES", "Collection", "detect_symmetry", "find_symmetry", "match", "match_prepared"]
-
-POOR_SCORE = 0.15
-"""Commutativity score above which a map is called poor; true maps of TOSCA have 0.03 (wolf) to 0.13 (cat)."""
+__all__ = ["METHODS", "SYMMETRIES", "Collection", "detect_symmetry", "find_symmetry", "match"]
 
 METHODS = ("quotient", "paper", "semi")
 
 SYMMETRIES = ("auto", "extrinsic", "detect", "none")
 """Ways to come to a shape's symmetry; a table of vertex maps is another."""
-
-# Expected seconds per step and 1000 vertices, for the share of work done; measured once, only their ratios matter.
-_COST = {"eigenpairs": 0.3, "plane": 0.025, "detect": 0.4, "transfer": 0.16, "quotient": 0.045, "maps": 0.07}
 
 
 def match(
@@ -129,7 +111,7 @@ def find_symmetry(
     known = collection.symmetry(shape, symmetry)
     scores = [commutativity_score(m, shape.basis, shape.basis) for m in known.group.maps]
     agreement = [orientation_agreement(shape.mesh, shape.mesh, m) for m in known.group.maps]
-    labels = [_label(a) if shape.oriented else "unknown" for a in agreement]
+    labels = [orientation_label(a) if shape.oriented else "unknown" for a in agreement]
     return SymmetryResult(
         known.group.maps,
         ("direct", *labels[1:]),
@@ -206,7 +188,7 @@ class Collection:
             return mesh
         mesh = self.load(mesh)
         if id(mesh) not in self._shapes:
-            with self.steps(f"eigenpairs of {mesh.name}", _COST["eigenpairs"] * mesh.n_verts / 1000):
+            with self.steps(f"eigenpairs of {mesh.name}", COST["eigenpairs"] * mesh.n_verts / 1000):
                 k = self.parameters.k_max
                 prepared = prepare(mesh, k, max(self.parameters.n_samples, N_ANCHORS), self.parameters.seed)
             self._shapes[id(mesh)] = (mesh, prepared)  # the mesh is kept so that its id stays its own
@@ -227,7 +209,7 @@ class Collection:
                 reference = self.shape(self._reference)
                 known = self.transfer(shape, reference, self.symmetry(reference, how))
             elif how == "detect":
-                with self.steps(f"symmetry of {shape.mesh.name} from its spectrum", _COST["detect"] * cost):
+                with self.steps(f"symmetry of {shape.mesh.name} from its spectrum", COST["detect"] * cost):
                     known = detected_symmetry(shape, self.parameters)
             elif how == "auto":
                 known = self.symmetry(shape)
@@ -235,7 +217,7 @@ class Collection:
                     detected = self.symmetry(shape, "detect")
                     known = detected if detected.firm or not known.known else known
             else:
-                with self.steps(f"mirror plane of {shape.mesh.name}", _COST["plane"] * cost):
+                with self.steps(f"mirror plane of {shape.mesh.name}", COST["plane"] * cost):
                     known = extrinsic_symmetry(shape)
             self._symmetries[key] = (shape, known)  # kept like the meshes above
         return self._symmetries[key][1]
@@ -244,7 +226,7 @@ class Collection:
         """A shape's symmetry by transfer from another; trivial if that has none."""
         if not known.known:
             return no_symmetry(shape, list(known.warnings))
-        with self.steps(f"symmetry transfer to {shape.mesh.name}", _COST["transfer"] * shape.n_verts / 1000):
+        with self.steps(f"symmetry transfer to {shape.mesh.name}", COST["transfer"] * shape.n_verts / 1000):
             return transferred_symmetry(shape, reference, known, self.parameters, self.way)
 
     def match(
@@ -300,7 +282,7 @@ class Collection:
         return known_x, known_y
 
     def expected_work(self, *meshes: Mesh | PreparedShape, symmetries: bool = True, match: bool = True) -> float:
-        """Expected work, in the unit of ``_COST``; what was done for an earlier pair costs nothing.
+        """Expected work, in the unit of ``COST``; what was done for an earlier pair costs nothing.
 
         Args:
             *meshes: the shapes, source first.
@@ -310,118 +292,14 @@ class Collection:
         """
         reference = [] if self._reference is None else [self._reference]
         new = [m for m in [*meshes, *reference] if isinstance(m, Mesh) and id(m) not in self._shapes]
-        work = _COST["eigenpairs"] * sum(m.n_verts for m in new)
+        work = COST["eigenpairs"] * sum(m.n_verts for m in new)
         if symmetries:
-            work += _COST["plane"] * sum(m.n_verts for m in reference or meshes)
+            work += COST["plane"] * sum(m.n_verts for m in reference or meshes)
             moved = meshes if reference else meshes[:1] if match else ()
-            work += _COST["transfer"] * sum(m.n_verts for m in moved)
+            work += COST["transfer"] * sum(m.n_verts for m in moved)
         if match:
-            work += (_COST["quotient"] + _COST["maps"]) * meshes[0].n_verts
+            work += (COST["quotient"] + COST["maps"]) * meshes[0].n_verts
         return work / 1000
-
-
-def match_prepared(
-    x: PreparedShape,
-    y: PreparedShape,
-    known_x: KnownSymmetry,
-    known_y: KnownSymmetry,
-    method: str = "quotient",
-    parameters: MatchParameters | None = None,
-    steps: Steps | None = None,
-) -> MatchResult:
-    """Match two prepared shapes with known symmetries; see :func:`match`."""
-    parameters = parameters or MatchParameters()
-    steps = steps or Steps()
-    earlier = dict(steps.seconds)
-    remarks = [*known_x.remarks(x.mesh.label), *known_y.remarks(y.mesh.label)]
-    warnings = list(dict.fromkeys([*x.warnings, *y.warnings, *remarks]))
-    if known_x.group.order != known_y.group.order:
-        warnings.append(
-            f"the groups differ ({known_x.group.order} and {known_y.group.order} elements): "
-            "matched with the identity alone"
-        )
-        known_x, known_y = no_symmetry(x), no_symmetry(y)
-    k = basis_size([x.basis, y.basis], parameters.k)
-    if k < parameters.k:
-        warnings.append(f"k is {k} instead of {parameters.k}: the next eigenvalues equal the one before them")
-    warnings += [text for shape in (x, y) if (text := _spectrum_warning(shape, k))]
-    details: dict[str, Any] = {
-        "source": {"name": x.mesh.label, "vertices": x.n_verts, "laplacian": x.operator, "symmetry": known_x.origin}
-        | known_x.details,
-        "target": {"name": y.mesh.label, "vertices": y.n_verts, "laplacian": y.operator, "symmetry": known_y.origin}
-        | known_y.details,
-    }
-    if not known_x.known:
-        warnings.append("no symmetry is used: of several equally good maps one comes back, possibly a mixture of them")
-    work = x.n_verts / 1000
-    oriented = x.oriented and y.oriented
-    separated = None
-    if method == "semi":
-        with steps("semi-quotient matching", _COST["quotient"] * work):
-            semi = match_semi_quotient(x, y, known_y.group, parameters)
-            even, p2p, fmap = semi.even, semi.orbit_map, None
-            if known_y.known:
-                p2p = choose_halves(p2p, known_y.group, known_x.sign, known_y.sign)
-    else:
-        with steps("quotient matching", _COST["quotient"] * work):
-            found = match_quotient(x, y, known_x.group, known_y.group, parameters)
-        even = found.fmap
-        with steps("point maps and refinement", _COST["maps"] * work):
-            if not known_x.known:
-                fmap = refine_fmap(found.fmap, x, y, parameters)
-            elif method == "quotient" and oriented:
-                fmap, odd = refine_by_odd_block(found, x, y, parameters)
-                details |= {"residual_direct": odd.residual_direct, "residual_mirrored": odd.residual_mirrored}
-                separated = odd.separated
-            else:
-                halves = choose_halves(found.orbit_map(x, y), known_y.group, known_x.sign, known_y.sign)
-                if parameters.refinement == "icp":
-                    fmap = refine_by_icp(halves, x, y, parameters)
-                else:
-                    samples = x.samples[: parameters.n_samples]
-                    fmap = correspondence_fmap(halves, found.source.full, found.target.full, samples)
-                    fmap = refine_fmap(fmap, x, y, parameters)
-            p2p = dense_map(fmap, x, y)
-    with steps("scores and labels"):
-        if fmap is None:
-            fmap = correspondence_fmap(p2p, x.basis.truncate(k), y.basis.truncate(k), x.samples)
-        maps = known_y.group.maps[:, p2p]
-        agreement = [orientation_agreement(x.mesh, y.mesh, m) for m in maps]
-        labels = [_label(a) if oriented else "unknown" for a in agreement]
-        if not oriented:
-            warnings.append("a mesh is not consistently orientable: direct and mirrored cannot be told apart")
-        elif separated is False or "unknown" in labels:
-            labels = ["unknown"] * len(labels)
-            numbers = {n: round(v, 2) for n, v in details.items() if n.startswith("residual")}
-            warnings.append(
-                f"direct and mirrored are not told apart: orientation agreement {[round(a, 2) for a in agreement]}"
-                + (f", residuals {numbers}" if numbers else "")
-            )
-        basis_y = y.basis.truncate(fmap.shape[0])
-        fmaps = torch.stack([p2p_to_fmap(m, basis_y, basis_y) @ fmap for m in known_y.group.maps])
-        scores = torch.tensor([commutativity_score(m, x.basis, y.basis) for m in maps], dtype=torch.float64)
-        if float(scores.min()) > POOR_SCORE:
-            warnings.append(
-                f"no map is near an isometry (best score {float(scores.min()):.2f}, 0 is exact, {POOR_SCORE} is poor): "
-                "the shapes differ too much, or their symmetries do not belong together"
-            )
-    order = sorted(range(len(labels)), key=lambda g: ("direct", "unknown", "mirrored").index(labels[g]))
-    return MatchResult(
-        maps=maps[order],
-        labels=tuple(labels[g] for g in order),
-        scores=scores[order],
-        orbits=maps[order].T.contiguous(),
-        fmaps=fmaps[order],
-        fmap_even=even,
-        symmetry_source=known_x.group.maps,
-        symmetry_target=known_y.group.maps,
-        orientation=torch.tensor(agreement, dtype=torch.float64)[order],
-        method=method,
-        warnings=warnings,
-        parameters=parameters.as_dict(),
-        seconds=steps.since(earlier),
-        details=details,
-    )
 
 
 def _gives_way(mine: KnownSymmetry, other: KnownSymmetry) -> bool:
@@ -433,20 +311,3 @@ def _gives_way(mine: KnownSymmetry, other: KnownSymmetry) -> bool:
     return (other.known and not mine.known) or (
         other.firm and not mine.firm and mine.origin in ("extrinsic", "detected")
     )
-
-
-def _spectrum_warning(shape: PreparedShape, k: int, rtol: float = 1e-3, most: float = 0.2) -> str | None:
-    """What to say of a spectrum with many equal eigenvalues: a rotation mixes the functions that share one."""
-    evals = shape.basis.evals[1:k]
-    equal = int((evals.diff() < rtol * evals[1:]).sum())
-    if equal <= most * k:
-        return None
-    return (
-        f"{shape.mesh.label}: ambiguous spectrum: {equal} of the first {k} eigenvalues equal their neighbour to "
-        f"{rtol:g}; the shape has more symmetry than one reflection, and which functions belong together is arbitrary"
-    )
-
-
-def _label(agreement: float) -> str:
-    """Name of a map by its orientation agreement; a map that is right on three quarters of the area has 0.5."""
-    return "direct" if agreement > 0.3 else "mirrored" if agreement < -0.3 else "unknown"

@@ -56,7 +56,6 @@ def match_quotient(
     group_x: SymmetryGroup,
     group_y: SymmetryGroup,
     parameters: MatchParameters,
-    values: tuple[Float[Tensor, "Vx C"], Float[Tensor, "Vy C"]] | None = None,
 ) -> QuotientMatch:
     """Algorithm 1 up to the point-to-orbit map: bases of L2+, descriptors, commutativity, least squares, quotient-ICP.
 
@@ -66,7 +65,6 @@ def match_quotient(
         group_x: symmetry group of the source.
         group_y: symmetry group of the target.
         parameters: ``k``, descriptors, ``commutativity``, ``icp_steps``, ``time``, ``n_samples`` are used.
-        values: the shared descriptors of both, if they are there already.
 
     References:
         Paper, section 4.3 and 4.4.
@@ -74,7 +72,7 @@ def match_quotient(
     k = basis_size([x.basis, y.basis], parameters.k)
     source = symmetrized_basis(x.basis.truncate(k), group_x)
     target = symmetrized_basis(y.basis.truncate(k), group_y)
-    values_x, values_y = values or shared_descriptors([x.basis, y.basis], parameters)
+    values_x, values_y = shared_descriptors([x.basis, y.basis], parameters)
     fmap = initial_fmap(source.even, target.even, values_x, values_y, parameters.commutativity)
     samples, among = x.samples[: parameters.n_samples], target.even.restricted(y.anchors)
     fmap = quotient_icp(

@@ -1,0 +1,153 @@
+"""From two prepared shapes and their symmetries to the dense maps between them, with labels and scores."""
+
+from typing import Any
+
+import torch
+
+from torchqm.fmap.convert import p2p_to_fmap
+from torchqm.fmap.refine import correspondence_fmap
+from torchqm.matching.initial import basis_size
+from torchqm.matching.known import KnownSymmetry, no_symmetry
+from torchqm.matching.parameters import MatchParameters
+from torchqm.matching.quality import commutativity_score, orientation_agreement
+from torchqm.matching.quotient import (
+    choose_halves,
+    dense_map,
+    match_quotient,
+    refine_by_icp,
+    refine_by_odd_block,
+    refine_fmap,
+)
+from torchqm.matching.result import MatchResult
+from torchqm.matching.semi_quotient import match_semi_quotient
+from torchqm.matching.shape import PreparedShape
+from torchqm.matching.steps import Steps
+
+__all__ = ["COST", "POOR_SCORE", "match_prepared", "orientation_label"]
+
+POOR_SCORE = 0.15
+"""Commutativity score above which a map is called poor; true maps of TOSCA have 0.03 (wolf) to 0.13 (cat)."""
+
+COST = {"eigenpairs": 0.3, "plane": 0.025, "detect": 0.4, "transfer": 0.16, "quotient": 0.045, "maps": 0.07}
+"""Expected seconds per step and 1000 vertices, for the share of work done; only their ratios matter."""
+
+
+def match_prepared(
+    x: PreparedShape,
+    y: PreparedShape,
+    known_x: KnownSymmetry,
+    known_y: KnownSymmetry,
+    method: str = "quotient",
+    parameters: MatchParameters | None = None,
+    steps: Steps | None = None,
+) -> MatchResult:
+    """Match two prepared shapes with known symmetries; see :func:`match`."""
+    parameters = parameters or MatchParameters()
+    steps = steps or Steps()
+    earlier = dict(steps.seconds)
+    remarks = [*known_x.remarks(x.mesh.label), *known_y.remarks(y.mesh.label)]
+    warnings = list(dict.fromkeys([*x.warnings, *y.warnings, *remarks]))
+    if known_x.group.order != known_y.group.order:
+        warnings.append(
+            f"the groups differ ({known_x.group.order} and {known_y.group.order} elements): "
+            "matched with the identity alone"
+        )
+        known_x, known_y = no_symmetry(x), no_symmetry(y)
+    k = basis_size([x.basis, y.basis], parameters.k)
+    if k < parameters.k:
+        warnings.append(f"k is {k} instead of {parameters.k}: the next eigenvalues equal the one before them")
+    warnings += [text for shape in (x, y) if (text := _spectrum_warning(shape, k))]
+    details: dict[str, Any] = {
+        "source": {"name": x.mesh.label, "vertices": x.n_verts, "laplacian": x.operator, "symmetry": known_x.origin}
+        | known_x.details,
+        "target": {"name": y.mesh.label, "vertices": y.n_verts, "laplacian": y.operator, "symmetry": known_y.origin}
+        | known_y.details,
+    }
+    if not known_x.known:
+        warnings.append("no symmetry is used: of several equally good maps one comes back, possibly a mixture of them")
+    work = x.n_verts / 1000
+    oriented = x.oriented and y.oriented
+    separated = None
+    if method == "semi":
+        with steps("semi-quotient matching", COST["quotient"] * work):
+            semi = match_semi_quotient(x, y, known_y.group, parameters)
+            even, p2p, fmap = semi.even, semi.orbit_map, None
+            if known_y.known:
+                p2p = choose_halves(p2p, known_y.group, known_x.sign, known_y.sign)
+    else:
+        with steps("quotient matching", COST["quotient"] * work):
+            found = match_quotient(x, y, known_x.group, known_y.group, parameters)
+        even = found.fmap
+        with steps("point maps and refinement", COST["maps"] * work):
+            if not known_x.known:
+                fmap = refine_fmap(found.fmap, x, y, parameters)
+            elif method == "quotient" and oriented:
+                fmap, odd = refine_by_odd_block(found, x, y, parameters)
+                details |= {"residual_direct": odd.residual_direct, "residual_mirrored": odd.residual_mirrored}
+                separated = odd.separated
+            else:
+                halves = choose_halves(found.orbit_map(x, y), known_y.group, known_x.sign, known_y.sign)
+                if parameters.refinement == "icp":
+                    fmap = refine_by_icp(halves, x, y, parameters)
+                else:
+                    samples = x.samples[: parameters.n_samples]
+                    fmap = correspondence_fmap(halves, found.source.full, found.target.full, samples)
+                    fmap = refine_fmap(fmap, x, y, parameters)
+            p2p = dense_map(fmap, x, y)
+    with steps("scores and labels"):
+        if fmap is None:
+            fmap = correspondence_fmap(p2p, x.basis.truncate(k), y.basis.truncate(k), x.samples)
+        maps = known_y.group.maps[:, p2p]
+        agreement = [orientation_agreement(x.mesh, y.mesh, m) for m in maps]
+        labels = [orientation_label(a) if oriented else "unknown" for a in agreement]
+        if not oriented:
+            warnings.append("a mesh is not consistently orientable: direct and mirrored cannot be told apart")
+        elif separated is False or "unknown" in labels:
+            labels = ["unknown"] * len(labels)
+            numbers = {n: round(v, 2) for n, v in details.items() if n.startswith("residual")}
+            warnings.append(
+                f"direct and mirrored are not told apart: orientation agreement {[round(a, 2) for a in agreement]}"
+                + (f", residuals {numbers}" if numbers else "")
+            )
+        basis_y = y.basis.truncate(fmap.shape[0])
+        fmaps = torch.stack([p2p_to_fmap(m, basis_y, basis_y) @ fmap for m in known_y.group.maps])
+        scores = torch.tensor([commutativity_score(m, x.basis, y.basis) for m in maps], dtype=torch.float64)
+        if float(scores.min()) > POOR_SCORE:
+            warnings.append(
+                f"no map is near an isometry (best score {float(scores.min()):.2f}, 0 is exact, {POOR_SCORE} is poor): "
+                "the shapes differ too much, or their symmetries do not belong together"
+            )
+    order = sorted(range(len(labels)), key=lambda g: ("direct", "unknown", "mirrored").index(labels[g]))
+    return MatchResult(
+        maps=maps[order],
+        labels=tuple(labels[g] for g in order),
+        scores=scores[order],
+        orbits=maps[order].T.contiguous(),
+        fmaps=fmaps[order],
+        fmap_even=even,
+        symmetry_source=known_x.group.maps,
+        symmetry_target=known_y.group.maps,
+        orientation=torch.tensor(agreement, dtype=torch.float64)[order],
+        method=method,
+        warnings=warnings,
+        parameters=parameters.as_dict(),
+        seconds=steps.since(earlier),
+        details=details,
+    )
+
+
+def _spectrum_warning(shape: PreparedShape, k: int, rtol: float = 1e-3, most: float = 0.2) -> str | None:
+    """What to say of a spectrum with many equal eigenvalues: a rotation mixes the functions that share one."""
+    evals = shape.basis.evals[1:k]
+    equal = int((evals.diff() < rtol * evals[1:]).sum())
+    if equal <= most * k:
+        return None
+    return (
+        f"{shape.mesh.label}: ambiguous spectrum: {equal} of the first {k} eigenvalues equal their neighbour to "
+        f"{rtol:g}; the shape has more symmetry than one reflection, and which functions belong together is arbitrary"
+    )
+
+
+def orientation_label(agreement: float) -> str:
+    """Name of a map by its orientation agreement; a map that is right on three quarters of the area has 0.5."""
+    return "direct" if agreement > 0.3 else "mirrored" if agreement < -0.3 else "unknown"
