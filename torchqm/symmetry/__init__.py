@@ -1,30 +1,54 @@
 """Floor 3: symmetry groups acting on a shape, even and odd functions, mirror planes, left and right."""
 
+from torchqm.symmetry.algebra import (
+    central_idempotents,
+    conjugacy_classes,
+    element_orders,
+    group_fault,
+    group_name,
+    inverses,
+    real_degrees,
+    subgroup,
+)
 from torchqm.symmetry.basis import SymmetrizedBasis, split_by_projector, symmetrized_basis
+from torchqm.symmetry.domains import FundamentalDomains, fundamental_domains
 from torchqm.symmetry.extrinsic import ExtrinsicReflection, find_reflection, find_reflections
 from torchqm.symmetry.group import GroupResiduals, SymmetryGroup, common_order
+from torchqm.symmetry.irreducible import IsotypicComponent, isotypic_components
 from torchqm.symmetry.leftright import LeftRight, displacement, halves_of_reflection, persistence_clusters
 from torchqm.symmetry.orientation import function_pairs, orientation_coefficients, orientation_form
 from torchqm.symmetry.projection import even_part, odd_part, projection_matrix
 
 __all__ = [
     "ExtrinsicReflection",
+    "FundamentalDomains",
     "GroupResiduals",
+    "IsotypicComponent",
     "LeftRight",
     "SymmetrizedBasis",
     "SymmetryGroup",
+    "central_idempotents",
     "common_order",
+    "conjugacy_classes",
     "displacement",
+    "element_orders",
     "even_part",
     "find_reflection",
     "find_reflections",
     "function_pairs",
+    "fundamental_domains",
+    "group_fault",
+    "group_name",
     "halves_of_reflection",
+    "inverses",
+    "isotypic_components",
     "odd_part",
     "orientation_coefficients",
     "orientation_form",
     "persistence_clusters",
     "projection_matrix",
+    "real_degrees",
     "split_by_projector",
+    "subgroup",
     "symmetrized_basis",
 ]
