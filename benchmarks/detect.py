@@ -19,12 +19,12 @@ from tqdm import tqdm
 
 from torchqm.data.scb import SCBenchmark
 from torchqm.data.synthetic import creature, exact_maps
-from torchqm.matching import Detection, MatchParameters, PreparedShape, detect_reflection, prepare
+from torchqm.matching import Detection, MatchParameters, PreparedShape, detect_group, prepare
 
 
 def timed(shape: PreparedShape) -> tuple[Detection, float]:
     start = perf_counter()
-    found = detect_reflection(shape)
+    found = detect_group(shape)
     return found, perf_counter() - start
 
 

@@ -253,6 +253,56 @@ def test_correspondence_fmap_of_an_exact_map(pair):
     torch.testing.assert_close(found @ found.T, identity(K), atol=1e-10, rtol=0)
 
 
+@pytest.mark.parametrize("steps", [1, 2])
+def test_upsample_projects_at_each_step(pair, steps):
+    """``project`` gets the correspondence matrix of each step, and what it makes of it is the next map."""
+    seen, made = [], []
+
+    def project(matrix):
+        seen.append(matrix)
+        made.append(nearest_isometry(matrix) + 0.01 * noise(*matrix.shape, seed=len(seen)))
+        return made[-1]
+
+    start = pair.even[:10, :10] + 0.05 * noise(10, 10)
+    sizes = [12, 15, 19]
+    found = upsample(start, pair.even_x, pair.even_y, pair.samples, sizes, steps, project)
+    assert found is made[-1]
+    assert [m.shape[0] for m in seen] == [size for size in sizes for _ in range(steps)]
+    for fmap, matrix in zip([start, *made], seen, strict=False):
+        images, size = pair.even_x.evecs[pair.samples, : len(fmap)] @ fmap.T, len(matrix)
+        partners = torch.cdist(images, pair.even_y.evecs[:, : len(fmap)]).argmin(1)
+        wanted = sum(
+            torch.outer(pair.even_y.evecs[y, :size], pair.even_x.evecs[x, :size])
+            for x, y in zip(pair.samples.tolist(), partners.tolist(), strict=True)
+        )
+        torch.testing.assert_close(matrix, wanted, atol=1e-9, rtol=0)
+
+
+def test_upsample_projects_to_the_nearest_isometry_by_default(pair):
+    start = pair.even[:10, :10] + 0.05 * noise(10, 10)
+    arguments = (start, pair.even_x, pair.even_y, pair.samples, [12, 15, 19])
+    found = upsample(*arguments)
+    assert torch.equal(found, upsample(*arguments, project=nearest_isometry))
+    assert not torch.equal(found, upsample(*arguments, project=lambda matrix: matrix))
+
+
+def test_upsample_projecting_to_the_truth_stays_there(pair):
+    """A self-map that is made a reflection at each step ends as the reflection, also from a few functions."""
+    truth = p2p_to_fmap(pair.shape.group.maps[1], pair.full_x, pair.full_x)
+    signs = torch.sign(truth.diagonal())
+    start = torch.diag(signs[:12])
+    found = upsample(
+        start,
+        pair.full_x,
+        pair.full_x,
+        pair.samples,
+        growing_sizes(12, K),
+        project=lambda matrix: torch.diag(torch.sign(matrix.diagonal())),
+    )
+    assert torch.equal(found, torch.diag(signs))
+    torch.testing.assert_close(found, truth, atol=1e-8, rtol=0)
+
+
 def test_upsample_without_sizes_changes_nothing(pair):
     assert upsample(pair.even, pair.even_x, pair.even_y, pair.samples, []) is pair.even
 

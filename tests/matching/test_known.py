@@ -5,7 +5,6 @@ from references.unchecked import unchecked
 
 from torchqm.data.synthetic import creature
 from torchqm.matching import extrinsic_symmetry, given_symmetry, no_symmetry, prepare, transferred_symmetry
-from torchqm.matching.known import best_fitting
 
 
 @pytest.fixture(scope="module")
@@ -64,21 +63,42 @@ def test_a_rough_plane_is_used_and_told(lopsided):
     assert f"rms {known.details['residual']:.4f}" in known.warnings[0]
 
 
-def test_the_plane_that_belongs_to_that_of_the_other_shape():
-    """Three planes, and on the other shape each in turn: always its counterpart is taken."""
-    x, y = (prepare(creature("ellipsoid", 1200, retriangulate=seed).mesh, 60) for seed in (1, 2))
-    known_x, known_y = extrinsic_symmetry(x), extrinsic_symmetry(y)
-    assert len(known_x.others) == len(known_y.others) == 2
-    for wanted in (known_y, *known_y.others):
-        found = best_fitting(x, y, known_x, wanted)
-        normals = [torch.tensor(known.details["normal"]) for known in (found, wanted)]
-        assert abs(float(normals[0] @ normals[1])) > 0.99
-        scores = sorted(found.details["reflections_tried"])
-        assert scores[0] < 0.01
-        assert scores[1] > 0.05
-        assert found.warnings == known_x.warnings
-    assert best_fitting(x, y, known_x, no_symmetry(y)) is known_x
-    assert best_fitting(x, y, known_y.others[0], known_y) is known_y.others[0]
+def test_several_planes_are_one_group():
+    body = creature("ellipsoid", 1200)
+    found = extrinsic_symmetry(prepare(body.mesh, 60))
+    assert (found.name, found.firm, found.reflection) == ("C2 x C2 x C2", True, False)
+    assert found.details["planes"] == 3
+    rows = [(body.base_group == row).all(1).nonzero().flatten().tolist() for row in found.group.maps]
+    assert sorted(index for (index,) in rows) == list(range(8))  # each element of the true group once
+    for (index,), turned in zip(rows, found.orientation, strict=True):
+        assert float(turned) == float(body.orientation[index])
+    for g, h in [(1, 2), (3, 4), (7, 1)]:
+        assert torch.equal(found.group.maps[found.products[g, h]], found.group.maps[g][found.group.maps[h]])
+    assert torch.equal(found.sign, torch.zeros_like(found.sign))
+
+
+def test_a_subset_of_a_group_has_left_and_right_of_its_own():
+    shape = prepare(creature("ellipsoid", 1200).mesh, 60)
+    known = extrinsic_symmetry(shape)
+    one = known.subset([0, 1], shape, {"why": "test"})
+    assert (one.name, one.reflection, one.details["why"]) == ("C2", True, "test")
+    plain = given_symmetry(shape, known.group.maps[:2])
+    assert torch.equal(one.sign, plain.sign)
+    assert float((one.sign * one.sign[one.group.maps[1]]).sum()) < -0.8 * shape.n_verts
+    turn = int((known.orientation > 0).nonzero()[1])
+    assert not known.subset([0, turn], shape, {}).reflection
+    assert known.subset(range(8), shape, {"why": "all"}).details["why"] == "all"
+
+
+def test_a_given_group():
+    body = creature("ellipsoid", 1200)
+    shape = prepare(body.mesh, 60)
+    known = given_symmetry(shape, body.base_group)
+    assert (known.name, known.origin, known.warnings) == ("C2 x C2 x C2", "file", [])
+    assert known.details["closure"] == 0
+    assert torch.equal(known.orientation, body.orientation.double())
+    with pytest.raises(ValueError, match="the 3 maps of the symmetry are no group"):
+        given_symmetry(shape, body.base_group[[0, 1, 2]])
 
 
 def test_a_given_symmetry_has_the_halves_of_its_axis():

@@ -223,7 +223,7 @@ class TestWithoutSymmetry:
         assert found.maps.shape == (1, lopsided[0].mesh.n_verts)
         assert (found.origin, found.details["verdict"]) == ("none", "asymmetric")
         (text,) = found.warnings
-        assert "no reflection was found" in text
+        assert "no symmetry was found" in text
         assert f"score {found.details['score']:.2f}" in text
 
     def test_groups_that_differ(self, pair):
@@ -413,7 +413,7 @@ class TestEqualEigenvalues:
         k = next(k for k in range(10, 30) if float(evals[k] - evals[k - 1]) < 1e-6 * float(evals[k]))
         found = match(mesh, mesh, method=method, parameters=FAST.changed(k=k))
         assert any(f"k is {k - 1} instead of {k}" in text for text in found.warnings)
-        assert found.maps.shape == (2, mesh.n_verts)
+        assert found.maps.shape == ({"quotient": 16, "semi": 2}[method], mesh.n_verts)
 
 
 class TestOrientation:
@@ -540,8 +540,9 @@ class TestInput:
         shape, copy = blob_meshes()
         with pytest.raises(ValueError, match="641 entries a row, but copy has 642"):
             match(shape.mesh, copy.mesh, symmetry=copy.group.maps[:, :-1], parameters=FAST)
-        with pytest.raises(ValueError, match="blob2: the symmetry has 4 elements"):
-            match(shape.mesh, copy.mesh, symmetry_source=blob(4).group.maps, parameters=FAST)
+        no_group = blob(8).group.subset([0, 1, 2])  # a product is missing
+        with pytest.raises(ValueError, match="the 3 maps of the symmetry are no group"):
+            match(blob(8).mesh, copy.mesh, symmetry_source=no_group.maps, parameters=FAST)
 
 
 def test_a_symmetry_must_be_a_table_and_may_be_an_array():
@@ -576,15 +577,62 @@ def test_every_refinement_is_carried_out(pair, method):
     assert not torch.equal(maps["icp"].fmaps, maps["upsample"].fmaps)
 
 
-def test_several_mirror_planes_and_poor_maps_are_told():
-    """An ellipsoid-like body has three planes: which of them is found on either shape is chance."""
-    body = creature("ellipsoid", 800)
+def test_poor_maps_are_told():
     small = MatchParameters(k=20, k_max=30, n_descriptors=20, n_samples=300, icp_steps=2)
-    known = extrinsic_symmetry(prepare(body.mesh, 30))
-    assert known.firm
-    assert any("2 more mirror plane(s) fit as well" in text for text in known.remarks("it"))
     other = match(creature("octopus", 800, pose=1).mesh, creature("quadruped", 800).mesh, parameters=small)
     assert any("no map is near an isometry" in text for text in other.warnings)
+
+
+class TestLargeGroups:
+    """Every element of a group gives a map: each true one comes out once, with the right label."""
+
+    @pytest.mark.parametrize(("kind", "order"), [("octopus", 16), ("ellipsoid", 8)])
+    def test_rest_to_rest(self, kind, order):
+        source, target = (creature(kind, 1500, retriangulate=seed) for seed in (1, 2))
+        found = match(source.mesh, target.mesh, parameters=MatchParameters(k_max=150))
+        assert found.maps.shape == (order, source.mesh.n_verts)
+        assert found.orbits.shape == (source.mesh.n_verts, order)
+        assert found.fmaps.shape[0] == order
+        assert found.warnings == [] or all("ambiguous spectrum" in text for text in found.warnings)
+        assert self.covered(source, target, found, 0.03) == set(range(order))
+        assert found.labels == ("direct",) * (order // 2) + ("mirrored",) * (order // 2)
+        for half in (found.scores[: order // 2], found.scores[order // 2 :]):
+            assert bool((half.diff() >= 0).all())  # the best first
+
+    def test_the_paper_uses_one_reflection_of_them(self):
+        source, target = (creature("ellipsoid", 1500, retriangulate=seed) for seed in (1, 2))
+        found = match(source.mesh, target.mesh, method="paper", parameters=MatchParameters(k_max=100))
+        assert found.maps.shape[0] == 2
+        assert any("made for one reflection" in text for text in found.warnings)
+        assert found.symmetry_source.shape[0] == found.symmetry_target.shape[0] == 2
+
+    def test_what_two_groups_have_in_common(self):
+        """One reflection given on the source, eight elements found on the target: the matching pair is used."""
+        source, target = (creature("ellipsoid", 1500, retriangulate=seed) for seed in (1, 2))
+        known = extrinsic_symmetry(prepare(source.mesh, 30))
+        for element in (1, 2, 3):
+            table = known.group.maps[[0, element]]
+            found = match(source.mesh, target.mesh, symmetry_source=table, parameters=MatchParameters(k_max=100))
+            assert found.maps.shape[0] == 2
+            assert any("groups differ (2 and 8 elements)" in text for text in found.warnings)
+            assert found.details["target"]["spectral_difference"] < 0.02
+            there = exact_maps(source, target).nearest_vertices()[0]  # the direct map takes one reflection to the other
+            gaps = target.mesh.verts[found.symmetry_target[1][there]] - target.mesh.verts[there[table[1]]]
+            assert float(gaps.norm(dim=1).mean()) < 0.05 * target.mesh.area**0.5
+
+    @staticmethod
+    def covered(source, target, found, tolerance):
+        """Which true maps the found ones are, each within a mean distance / sqrt(area)."""
+        truth = exact_maps(source, target).points(target.mesh)
+        verts, size = target.mesh.verts, target.mesh.area**0.5
+        elements = []
+        for label, p2p in zip(found.labels, found.maps, strict=True):
+            gaps = torch.stack([(verts[p2p] - points).norm(dim=1).mean() for points in truth]) / size
+            element = int(gaps.argmin())
+            assert float(gaps[element]) < tolerance
+            assert label == ("direct" if source.orientation[element] > 0 else "mirrored")
+            elements.append(element)
+        return set(elements)
 
 
 def test_seconds_are_those_of_this_match(pair):

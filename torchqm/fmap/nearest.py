@@ -12,7 +12,7 @@ from torch import Tensor
 
 __all__ = ["SurfaceSearch", "nearest_rows"]
 
-_SMALL = 2_000_000  # distance entries below which one dense product beats building an index
+_SMALL = 200_000  # distance entries below which one dense product is as quick as a blocked one
 _FEW = 96  # coordinates up to which blocked products beat faiss (4 times at 20, equal at 100; 2,000 x 5,000)
 
 

@@ -1,6 +1,6 @@
 """Refinement of functional maps: quotient-ICP, semi-quotient ICP, spectral upsampling (paper, sections 4.3, 5, 7.4)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Float, Int
@@ -155,6 +155,7 @@ def upsample(
     samples: Int[Tensor, " S"],
     sizes: Sequence[int],
     steps: int = 1,
+    project: Callable[[Tensor], Tensor] = nearest_isometry,
 ) -> Float[Tensor, "Ly Lx"]:
     """Spectral upsampling with orthogonal projection: match the samples at one size, read the map off at the next.
 
@@ -168,6 +169,7 @@ def upsample(
         samples: vertex ids of x, drawn by area.
         sizes: numbers of functions, one after the other.
         steps: iterations at each size.
+        project: what is made of the correspondence matrix at each step.
 
     Returns:
         The map at the last size.
@@ -185,7 +187,7 @@ def upsample(
         for _ in range(steps):
             ky, kx = fmap_xy.shape
             partners = nearest_used(basis_x.evecs[samples, :kx] @ fmap_xy.T, basis_y.truncate(ky))
-            fmap_xy = nearest_isometry(small_y.evecs[partners].T @ sources)
+            fmap_xy = project(small_y.evecs[partners].T @ sources)
     return fmap_xy
 
 

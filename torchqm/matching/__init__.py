@@ -1,6 +1,6 @@
 """Floor 5: the matchers: quotient, semi-quotient, symmetry transfer, and the pipeline that joins them."""
 
-from torchqm.matching.detect import Detection, detect_reflection
+from torchqm.matching.detect import Detection, detect_group
 from torchqm.matching.known import KnownSymmetry, extrinsic_symmetry, given_symmetry, no_symmetry, transferred_symmetry
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
 from torchqm.matching.parameters import MatchError, MatchParameters
@@ -36,7 +36,7 @@ __all__ = [
     "SymmetryResult",
     "SymmetryTransfer",
     "choose_halves",
-    "detect_reflection",
+    "detect_group",
     "detect_symmetry",
     "extrinsic_symmetry",
     "find_symmetry",

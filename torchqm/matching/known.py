@@ -1,29 +1,34 @@
-"""Where a shape's symmetry comes from: its mirror plane, the user, or a reference shape."""
+"""Where a shape's symmetry comes from: its mirror planes, its spectrum, the user, or a reference shape."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from math import isfinite
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.fmap.convert import p2p_to_fmap
-from torchqm.matching.detect import detect_reflection
+from torchqm.matching.detect import detect_group
 from torchqm.matching.parameters import MatchError, MatchParameters
 from torchqm.matching.parity import odd_halves
+from torchqm.matching.quality import orientation_agreement
 from torchqm.matching.self_map import nearest_involution
 from torchqm.matching.shape import PreparedShape
 from torchqm.matching.symmetry_file import reflection_fault, return_error
 from torchqm.matching.transfer import transfer_symmetry
-from torchqm.symmetry.basis import symmetrized_basis
-from torchqm.symmetry.extrinsic import ExtrinsicReflection, find_reflections
+from torchqm.symmetry.algebra import group_name
+from torchqm.symmetry.extrinsic import ExtrinsicReflection, extrinsic_group, find_reflections
 from torchqm.symmetry.group import SymmetryGroup
 from torchqm.symmetry.leftright import halves_of_reflection
 
+MAX_CLOSURE = 0.1
+"""Mean distance / sqrt(area) between the product of two maps of a given group and the nearest of its maps, at most."""
+
 __all__ = [
     "KnownSymmetry",
-    "best_fitting",
     "detected_symmetry",
     "extrinsic_symmetry",
     "given_symmetry",
@@ -32,21 +37,19 @@ __all__ = [
 ]
 
 
-N_COMPARED = 30
-"""Functions whose symmetric part is compared to tell reflections of a shape apart."""
-
-
 @dataclass(frozen=True, eq=False)
 class KnownSymmetry:
-    """A symmetry group with the left-right map that goes with its reflection.
+    """A symmetry group, with the left-right map that goes with it where it is one reflection.
 
     Args:
         group: the group; trivial if the shape has no symmetry that is known.
-        sign: ``(V,)`` -1 on one half, +1 on the other, 0 on the axis; all 0 for the trivial group.
+        sign: ``(V,)`` of one reflection: -1 on one half, +1 on the other, 0 on the axis; all 0 for other groups.
         origin: ``extrinsic``, ``detected``, ``file``, ``transfer`` or ``none``.
         warnings: what is doubtful, with the numbers.
         details: numbers for the summary.
-        others: further reflections that the shape has just as well, each alone; see :func:`best_fitting`.
+        table: multiplication table ``(G, G)``; not needed for groups of one or two elements.
+        turned: ``(G,)`` +1 where an element keeps the orientation of the surface, -1 where it turns it over; by default
+            the second element of a pair is a reflection.
     """
 
     group: SymmetryGroup
@@ -54,7 +57,8 @@ class KnownSymmetry:
     origin: str
     warnings: list[str] = field(default_factory=list)
     details: dict[str, Any] = field(default_factory=dict)
-    others: tuple["KnownSymmetry", ...] = ()
+    table: Int[Tensor, "G G"] | None = None
+    turned: Float[Tensor, " G"] | None = None
 
     @property
     def known(self) -> bool:
@@ -66,10 +70,59 @@ class KnownSymmetry:
         """Whether it is known without a doubt: a better source for a transfer than a doubtful symmetry of one's own."""
         return self.known and not self.warnings
 
-    def remarks(self, name: str) -> list[str]:
-        """The warnings, and what to say of further reflections of the shape of that name."""
-        more = f"{name}: {len(self.others)} more mirror plane(s) fit as well; only one reflection is used"
-        return [*self.warnings, more] if self.others else self.warnings
+    @property
+    def reflection(self) -> bool:
+        """Whether it is one reflection: what the paper's own way is made for."""
+        return self.group.order == 2 and float(self.orientation[1]) < 0
+
+    @cached_property
+    def products(self) -> Int[Tensor, "G G"]:
+        """Which element is ``g o h``."""
+        if self.table is not None:
+            return self.table
+        order = self.group.order
+        if order > 2:
+            raise ValueError(f"table: needed for a group of {order} elements")
+        return torch.arange(order)[:, None] ^ torch.arange(order)
+
+    @cached_property
+    def orientation(self) -> Float[Tensor, " G"]:
+        """+1 and -1, see ``turned``."""
+        if self.turned is not None:
+            return self.turned
+        return torch.tensor([1.0, -1.0][: self.group.order], dtype=torch.float64)
+
+    @property
+    def name(self) -> str:
+        """Of the group, such as ``C2``: see :func:`torchqm.symmetry.algebra.group_name`."""
+        return group_name(self.products)
+
+    def subset(self, elements: Sequence[int], shape: PreparedShape, details: dict[str, Any]) -> "KnownSymmetry":
+        """A subgroup, element 0 first, with its own left and right if it is a reflection.
+
+        Args:
+            elements: which.
+            shape: the shape.
+            details: more numbers.
+        """
+        chosen = list(elements)
+        if len(chosen) == self.group.order:
+            return replace(self, details=self.details | details)
+        group, orientation = self.group.subset(chosen), self.orientation[chosen]
+        number = torch.full((self.group.order,), -1, dtype=torch.int64)
+        number[chosen] = torch.arange(len(chosen))
+        sign = torch.zeros_like(self.sign)
+        if group.order == 2 and float(orientation[1]) < 0:
+            sign = _halves(shape, group.maps[1])
+        table = number[self.products[chosen][:, chosen]]
+        return KnownSymmetry(group, sign, self.origin, self.warnings, self.details | details, table, orientation)
+
+
+def _halves(shape: PreparedShape, reflection: Int[Tensor, " V"]) -> Float[Tensor, " V"]:
+    """Left and right of a reflection from its odd functions; 0 where the two do not change places."""
+    small = shape.basis.truncate(min(60, shape.basis.k))
+    halves = odd_halves(shape.mesh, small, nearest_involution(p2p_to_fmap(reflection, small, small)))
+    return torch.where(halves * halves[reflection] < 0, halves, 0.0)
 
 
 def no_symmetry(shape: PreparedShape, warnings: list[str] | None = None) -> KnownSymmetry:
@@ -79,28 +132,54 @@ def no_symmetry(shape: PreparedShape, warnings: list[str] | None = None) -> Know
 
 
 def extrinsic_symmetry(shape: PreparedShape, max_residual: float = 0.02) -> KnownSymmetry:
-    """The reflection in the best mirror plane, if the shape is its own mirror image up to ``max_residual``.
+    """The group that the mirror planes generate in which the shape is its own mirror image up to ``max_residual``.
 
     Args:
         shape: the shape.
         max_residual: root mean square distance to the mirror image / sqrt(area) above which there is no plane.
 
     Returns:
-        The reflection, with a warning if its residual is more than the triangulation explains; above ``max_residual``
-        the trivial group, with a warning that gives the residual. Where several planes fit equally well they are in
-        ``others``.
+        The reflection, or the group that several planes generate; with a warning if the residual of the best plane is
+        more than the triangulation explains. Above ``max_residual`` the trivial group, with a warning that gives the
+        residual.
 
     References:
         Paper, sections 6.2 and 7.
     """
     found, *more = find_reflections(shape.mesh)
     if found.residual <= max_residual:
-        first, *others = (_reflection(shape, plane) for plane in (found, *more) if plane.residual <= max_residual)
-        return replace(first, others=tuple(others))
+        planes = [found, *(plane for plane in more if plane.residual <= max_residual)]
+        known = _reflection(shape, found)
+        return known if len(planes) == 1 else _several(shape, known, planes, max_residual)
     text = f"{shape.mesh.label}: no mirror plane: the best one leaves a residual above {max_residual:g}"
     numbers, details = _numbers(found)
     none = no_symmetry(shape, [f"{text} ({numbers})"])
     return replace(none, details=details)
+
+
+def _several(
+    shape: PreparedShape, first: KnownSymmetry, planes: list[ExtrinsicReflection], max_residual: float
+) -> KnownSymmetry:
+    """The group of several planes; the first reflection alone, with a warning, where they make no finite group."""
+    name = shape.mesh.label
+    try:
+        found = extrinsic_group(shape.mesh, planes)
+    except ValueError as error:
+        return replace(first, warnings=[*first.warnings, f"{error}; one reflection is used"])
+    residuals = found.group.residuals(shape.mesh.verts, shape.mesh.vertex_areas)
+    if found.residual > 2 * max_residual or not residuals.is_group:
+        text = f"{name}: {len(planes)} mirror planes fit, but not all their products; one reflection is used"
+        return replace(first, warnings=[*first.warnings, f"{text} (residual {found.residual:.4f})"])
+    details = first.details | {"planes": len(planes), "group": residuals.name, "residual_of_products": found.residual}
+    return KnownSymmetry(
+        found.group,
+        torch.zeros_like(first.sign),
+        "extrinsic",
+        first.warnings,
+        details,
+        residuals.products,
+        found.orientation,
+    )
 
 
 def _numbers(found: ExtrinsicReflection) -> tuple[str, dict[str, Any]]:
@@ -125,58 +204,28 @@ def _reflection(shape: PreparedShape, found: ExtrinsicReflection) -> KnownSymmet
     return KnownSymmetry(SymmetryGroup.from_reflection(found.map), sign, "extrinsic", warnings, details)
 
 
-def best_fitting(x: PreparedShape, y: PreparedShape, known_x: KnownSymmetry, known_y: KnownSymmetry) -> KnownSymmetry:
-    """Of a shape's several reflections the one that belongs to the reflection of the other shape.
-
-    Which of its planes comes first is chance. Of isometric shapes the quotients by matching reflections are isometric,
-    so their symmetric functions have the same eigenvalues; the reflection is taken for which these differ least.
-
-    Args:
-        x: the shape with several reflections.
-        y: the shape to match it to.
-        known_x: the first of them, with its ``others``.
-        known_y: the reflection of y.
-
-    Returns:
-        The reflection of x, with the relative differences of all in its ``details``.
-
-    References:
-        Paper, Lemma 3.2: the quotients of isometric shapes are isometric.
-    """
-    if not known_x.others or known_y.group.order != 2:
-        return known_x
-    k = min(N_COMPARED, x.basis.k, y.basis.k)
-    wanted = symmetrized_basis(y.basis.truncate(k), known_y.group).even_evals
-    choices = [known_x, *known_x.others]
-    differences = []
-    for choice in choices:
-        own = symmetrized_basis(x.basis.truncate(k), choice.group).even_evals
-        n = min(len(own), len(wanted))
-        differences.append(float((own[:n] - wanted[:n]).norm() / wanted[:n].norm().clamp_min(1e-300)))
-    best = choices[differences.index(min(differences))]
-    details = best.details | {"reflections_tried": [round(value, 4) for value in differences]}
-    return replace(best, warnings=known_x.warnings, details=details)
-
-
 def detected_symmetry(shape: PreparedShape, parameters: MatchParameters) -> KnownSymmetry:
-    """The reflection of a shape from its own spectrum (:func:`torchqm.matching.detect.detect_reflection`).
+    """The symmetries of a shape from its own spectrum (:func:`torchqm.matching.detect.detect_group`).
 
     Returns:
-        The reflection, with a warning if the verdict is ``ambiguous``; the trivial group, with a warning, if it is
+        The group, with a warning if the verdict is ``ambiguous``; the trivial group, with a warning, if it is
         ``asymmetric``. The verdict and its numbers are in ``details``.
     """
-    found = detect_reflection(shape, parameters)
-    details: dict[str, Any] = {"verdict": found.verdict, "candidates": found.candidates, **found.parts}
+    found = detect_group(shape, parameters)
+    details: dict[str, Any] = {"verdict": found.verdict, "group": found.name, "candidates": found.candidates}
+    details |= found.parts
     origin = "detected" if found.group.order > 1 else "none"
-    return KnownSymmetry(found.group, found.sign, origin, found.warnings, details)
+    return KnownSymmetry(
+        found.group, found.sign, origin, found.warnings, details, found.products, found.orientation[: found.group.order]
+    )
 
 
 def given_symmetry(shape: PreparedShape, maps: Tensor, origin: str = "file") -> KnownSymmetry:
-    """A symmetry handed in as a table of vertex maps, row 0 the identity; left and right from its odd functions.
+    """A symmetry handed in as a table of vertex maps, row 0 the identity.
 
     Raises:
-        MatchError: wrong length or ids, row 0 is not the identity, more than one reflection, or a map that is no
-            reflection (:func:`torchqm.matching.symmetry_file.reflection_fault`).
+        MatchError: wrong length or ids, row 0 is not the identity, a pair whose second map is no reflection
+            (:func:`torchqm.matching.symmetry_file.reflection_fault`), or more maps that are no group.
 
     References:
         Paper, section 6.1; :func:`torchqm.matching.parity.odd_halves` instead of the clustering, which can fail.
@@ -191,21 +240,32 @@ def given_symmetry(shape: PreparedShape, maps: Tensor, origin: str = "file") -> 
             f"the symmetry has {maps.shape[1]} entries a row, but {shape.mesh.label} has {shape.n_verts} vertices"
         )
     group = SymmetryGroup(maps)
+    none = torch.zeros_like(shape.basis.mass)
     if group.order == 1:
-        return KnownSymmetry(group, torch.zeros_like(shape.basis.mass), origin)
+        return KnownSymmetry(group, none, origin)
     if group.order > 2:
-        raise MatchError(
-            f"{shape.mesh.label}: the symmetry has {group.order} elements; dense maps are extracted for one reflection "
-            "(2 elements) so far"
-        )
+        return _given_group(shape, group, origin)
     reflection = group.maps[1]
     fault = reflection_fault(shape.mesh, reflection)
     if fault is not None:
         raise MatchError(f"{shape.mesh.label}: row 1 of the symmetry is no reflection: {fault}")
-    small = shape.basis.truncate(min(60, shape.basis.k))
-    halves = odd_halves(shape.mesh, small, nearest_involution(p2p_to_fmap(reflection, small, small)))
-    sign = torch.where(halves * halves[reflection] < 0, halves, 0.0)
-    return KnownSymmetry(group, sign, origin, [], {"involution_error": return_error(shape.mesh, reflection)})
+    error = return_error(shape.mesh, reflection)
+    return KnownSymmetry(group, _halves(shape, reflection), origin, [], {"involution_error": error})
+
+
+def _given_group(shape: PreparedShape, group: SymmetryGroup, origin: str) -> KnownSymmetry:
+    """A table of more than two maps, if it is closed under composition."""
+    residuals = group.residuals(shape.mesh.verts, shape.mesh.vertex_areas)
+    worst = max(residuals.closure, residuals.inverse)
+    fault = residuals.fault
+    if fault is None and worst > MAX_CLOSURE:
+        fault = f"products of two maps are {worst:.3f} sqrt(area) from the nearest map ({MAX_CLOSURE:g} is allowed)"
+    if fault is not None:
+        raise MatchError(f"{shape.mesh.label}: the {group.order} maps of the symmetry are no group: {fault}")
+    agreement = [orientation_agreement(shape.mesh, shape.mesh, row) if shape.oriented else 1.0 for row in group.maps]
+    turned = torch.tensor([-1.0 if value < 0 else 1.0 for value in agreement], dtype=torch.float64)
+    details = {"group": residuals.name, "closure": residuals.closure, "inverse": residuals.inverse}
+    return KnownSymmetry(group, torch.zeros_like(shape.basis.mass), origin, [], details, residuals.products, turned)
 
 
 def transferred_symmetry(

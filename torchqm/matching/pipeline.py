@@ -12,7 +12,6 @@ from torchqm.geometry.io import load_mesh
 from torchqm.geometry.mesh import Mesh
 from torchqm.matching.known import (
     KnownSymmetry,
-    best_fitting,
     detected_symmetry,
     extrinsic_symmetry,
     given_symmetry,
@@ -25,6 +24,7 @@ from torchqm.matching.quality import commutativity_score, orientation_agreement
 from torchqm.matching.result import MatchResult, SymmetryResult
 from torchqm.matching.shape import N_ANCHORS, PreparedShape, prepare
 from torchqm.matching.steps import StepListener, Steps
+from torchqm.matching.subgroups import first_reflection
 
 __all__ = ["METHODS", "SYMMETRIES", "Collection", "detect_symmetry", "find_symmetry", "match"]
 
@@ -50,7 +50,7 @@ def match(
     First the symmetry of both must be known. With ``symmetry='auto'`` a mirror plane is looked for in the reference if
     there is one, else in both shapes; a shape without plane gets its symmetry by transfer from one that has it
     (sections 5 and 6.1), and if none has, each is asked its own spectrum
-    (:func:`torchqm.matching.detect.detect_reflection`). Then the two are matched in the quotient (section 4).
+    (:func:`torchqm.matching.detect.detect_group`). Then the two are matched in the quotient (section 4).
 
     Args:
         source: a mesh or its file.
@@ -117,7 +117,7 @@ def find_symmetry(
         ("direct", *labels[1:]),
         torch.tensor(scores, dtype=torch.float64),
         known.origin,
-        [*shape.warnings, *known.remarks(shape.mesh.label)],
+        [*shape.warnings, *known.warnings],
         collection.parameters.as_dict(),
         dict(collection.steps.seconds),
         {**known.details, "orientation": agreement},
@@ -226,6 +226,18 @@ class Collection:
         """A shape's symmetry by transfer from another; trivial if that has none."""
         if not known.known:
             return no_symmetry(shape, list(known.warnings))
+        if not known.reflection:
+            # What is transferred is one reflection; a larger group is looked for in the shape itself first.
+            found = self.symmetry(shape, "detect")
+            if found.known:
+                return found
+            single = first_reflection(reference, known)
+            if single is None:
+                text = (
+                    f"{reference.mesh.label}: its symmetry ({known.name}) has no reflection that could be transferred"
+                )
+                return no_symmetry(shape, [*found.warnings, text])
+            known = single
         with self.steps(f"symmetry transfer to {shape.mesh.name}", COST["transfer"] * shape.n_verts / 1000):
             return transferred_symmetry(shape, reference, known, self.parameters, self.way)
 
@@ -277,9 +289,16 @@ class Collection:
             known_x = self.transfer(x, y, known_y)
         elif _gives_way(known_y, known_x):
             known_y = self.transfer(y, x, known_x)
-        elif known_x.others and known_y.known:
-            known_x = best_fitting(x, y, known_x, known_y)
+        if how == "auto" and self.method == "quotient" and max(known_x.group.order, known_y.group.order) > 2:
+            known_x, known_y = self._larger(x, known_x), self._larger(y, known_y)
         return known_x, known_y
+
+    def _larger(self, shape: PreparedShape, known: KnownSymmetry) -> KnownSymmetry:
+        """The group that the spectrum shows, if it is larger: an octopus in a pose may have kept one or two planes."""
+        if known.origin not in ("extrinsic", "transfer") or known.details.get("planes", 1) > 3:
+            return known
+        found = self.symmetry(shape, "detect")
+        return found if found.group.order > known.group.order else known
 
     def expected_work(self, *meshes: Mesh | PreparedShape, symmetries: bool = True, match: bool = True) -> float:
         """Expected work, in the unit of ``COST``; what was done for an earlier pair costs nothing.

@@ -8,6 +8,7 @@ from torchqm.fmap.convert import p2p_to_fmap
 from torchqm.fmap.refine import correspondence_fmap
 from torchqm.matching.initial import basis_size
 from torchqm.matching.known import KnownSymmetry, no_symmetry
+from torchqm.matching.orbits import full_map_from_orbits, quotient_size
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.quality import commutativity_score, orientation_agreement
 from torchqm.matching.quotient import (
@@ -22,6 +23,7 @@ from torchqm.matching.result import MatchResult
 from torchqm.matching.semi_quotient import match_semi_quotient
 from torchqm.matching.shape import PreparedShape
 from torchqm.matching.steps import Steps
+from torchqm.matching.subgroups import common_symmetry, one_reflection
 
 __all__ = ["COST", "POOR_SCORE", "match_prepared", "orientation_label"]
 
@@ -45,14 +47,24 @@ def match_prepared(
     parameters = parameters or MatchParameters()
     steps = steps or Steps()
     earlier = dict(steps.seconds)
-    remarks = [*known_x.remarks(x.mesh.label), *known_y.remarks(y.mesh.label)]
-    warnings = list(dict.fromkeys([*x.warnings, *y.warnings, *remarks]))
-    if known_x.group.order != known_y.group.order:
+    warnings = list(dict.fromkeys([*x.warnings, *y.warnings, *known_x.warnings, *known_y.warnings]))
+    before = known_x.group.order, known_y.group.order
+    names = known_x.name, known_y.name
+    if before[0] == 1 or before[1] == 1:
+        known_x, known_y = (known if max(before) == 1 else no_symmetry(s) for s, known in ((x, known_x), (y, known_y)))
+    elif method == "quotient":
+        known_x, known_y = common_symmetry(x, y, known_x, known_y)
+    else:
+        known_x, known_y = one_reflection(x, y, known_x, known_y)
+    after = known_x.group.order
+    if before[0] != before[1]:
+        used = "the identity alone" if after == 1 else f"the {after} elements that both have ({known_x.name})"
+        warnings.append(f"the groups differ ({before[0]} and {before[1]} elements): matched with {used}")
+    elif after != before[0]:
         warnings.append(
-            f"the groups differ ({known_x.group.order} and {known_y.group.order} elements): "
-            "matched with the identity alone"
+            f"of the symmetries ({names[0]} and {names[1]}, {before[0]} elements) {after} elements are used"
+            + ("" if method == "quotient" else f": method {method!r} is made for one reflection")
         )
-        known_x, known_y = no_symmetry(x), no_symmetry(y)
     k = basis_size([x.basis, y.basis], parameters.k)
     if k < parameters.k:
         warnings.append(f"k is {k} instead of {parameters.k}: the next eigenvalues equal the one before them")
@@ -76,11 +88,17 @@ def match_prepared(
                 p2p = choose_halves(p2p, known_y.group, known_x.sign, known_y.sign)
     else:
         with steps("quotient matching", COST["quotient"] * work):
-            found = match_quotient(x, y, known_x.group, known_y.group, parameters)
+            one = known_x.group.order == 1 or (known_x.reflection and known_y.reflection)
+            k_used = None if one else quotient_size(known_x.group.order, parameters)
+            found = match_quotient(x, y, known_x.group, known_y.group, parameters, k_used)
         even = found.fmap
         with steps("point maps and refinement", COST["maps"] * work):
             if not known_x.known:
                 fmap = refine_fmap(found.fmap, x, y, parameters)
+            elif not one:
+                orbits = full_map_from_orbits(found, x, y, known_x, known_y, parameters)
+                details |= {"orbit_residual": orbits.residual}
+                fmap = refine_fmap(orbits.fmap, x, y, parameters)
             elif method == "quotient" and oriented:
                 fmap, odd = refine_by_odd_block(found, x, y, parameters)
                 details |= {"residual_direct": odd.residual_direct, "residual_mirrored": odd.residual_mirrored}
@@ -117,7 +135,8 @@ def match_prepared(
                 f"no map is near an isometry (best score {float(scores.min()):.2f}, 0 is exact, {POOR_SCORE} is poor): "
                 "the shapes differ too much, or their symmetries do not belong together"
             )
-    order = sorted(range(len(labels)), key=lambda g: ("direct", "unknown", "mirrored").index(labels[g]))
+    rank = ("direct", "unknown", "mirrored")
+    order = sorted(range(len(labels)), key=lambda g: (rank.index(labels[g]), float(scores[g])))
     return MatchResult(
         maps=maps[order],
         labels=tuple(labels[g] for g in order),

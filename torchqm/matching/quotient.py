@@ -56,6 +56,7 @@ def match_quotient(
     group_x: SymmetryGroup,
     group_y: SymmetryGroup,
     parameters: MatchParameters,
+    k: int | None = None,
 ) -> QuotientMatch:
     """Algorithm 1 up to the point-to-orbit map: bases of L2+, descriptors, commutativity, least squares, quotient-ICP.
 
@@ -65,11 +66,12 @@ def match_quotient(
         group_x: symmetry group of the source.
         group_y: symmetry group of the target.
         parameters: ``k``, descriptors, ``commutativity``, ``icp_steps``, ``time``, ``n_samples`` are used.
+        k: functions instead of ``parameters.k``: of a large group only few of these are symmetric.
 
     References:
         Paper, section 4.3 and 4.4.
     """
-    k = basis_size([x.basis, y.basis], parameters.k)
+    k = basis_size([x.basis, y.basis], parameters.k if k is None else k)
     source = symmetrized_basis(x.basis.truncate(k), group_x)
     target = symmetrized_basis(y.basis.truncate(k), group_y)
     values_x, values_y = shared_descriptors([x.basis, y.basis], parameters)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchqm.fmap.convert import nearest_used, p2p_to_fmap
-from torchqm.fmap.refine import growing_sizes, quotient_icp, upsample
+from torchqm.fmap.refine import growing_sizes, nearest_isometry, quotient_icp, upsample
 from torchqm.fmap.solve import solve_fmap
 from torchqm.matching.initial import basis_size, shared_descriptors, unit_columns_pair
 from torchqm.matching.parameters import MatchParameters
@@ -176,7 +176,12 @@ def nearest_involution(matrix: Float[Tensor, "K K"]) -> Float[Tensor, "K K"]:
 
 
 def grow_self_map(
-    fmap: Float[Tensor, "K K"], x: PreparedShape, parameters: MatchParameters, k: int, n_anchors: int = N_ANCHORS
+    fmap: Float[Tensor, "K K"],
+    x: PreparedShape,
+    parameters: MatchParameters,
+    k: int,
+    n_anchors: int = N_ANCHORS,
+    involution: bool = True,
 ) -> Float[Tensor, "K2 K2"]:
     """Refine a self-map up to ``k`` functions by the way that ``parameters.refinement`` names.
 
@@ -186,14 +191,14 @@ def grow_self_map(
         parameters: ``refinement``, ``growth`` and ``n_samples`` are used.
         k: functions to reach; at most ``k_max`` and what the basis holds.
         n_anchors: vertices among which partners are looked for.
+        involution: whether it is one, and is made one after each step of ``upsample``.
     """
     k = min(k, parameters.k_max, x.basis.k)
     if parameters.refinement == "none" or k <= fmap.shape[0]:
         return fmap
-    samples, among = x.samples[: parameters.n_samples], x.basis.restricted(x.samples[:n_anchors])
+    samples, among = x.samples[: parameters.n_samples], x.basis.truncate(k).restricted(x.samples[:n_anchors])
     if parameters.refinement == "icp":  # section 7.4: five steps at 100, three at 300
         return upsample(fmap, x.basis, among, samples, [k], steps=5 if k <= K_CHOICE else 3)
-    for size in growing_sizes(fmap.shape[0], k, parameters.growth):
-        # Without the projection the self-map drifts towards the identity, the best map of a shape to itself.
-        fmap = nearest_involution(upsample(fmap, x.basis, among, samples, [size]))
-    return fmap
+    # Without the projection a self-map drifts towards the identity, the best map of a shape to itself.
+    project = nearest_involution if involution else nearest_isometry
+    return upsample(fmap, x.basis, among, samples, growing_sizes(fmap.shape[0], k, parameters.growth), project=project)

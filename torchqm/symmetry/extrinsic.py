@@ -1,5 +1,6 @@
 """The mirror plane of an undeformed shape: many starts, refined by reflective ICP (paper, sections 6.2 and 7)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,8 +12,9 @@ from torch import Tensor
 
 from torchqm.geometry.mesh import Mesh
 from torchqm.geometry.sampling import area_samples
+from torchqm.symmetry.group import SymmetryGroup
 
-__all__ = ["ExtrinsicReflection", "find_reflection", "find_reflections"]
+__all__ = ["ExtrinsicGroup", "ExtrinsicReflection", "extrinsic_group", "find_reflection", "find_reflections"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +123,67 @@ def find_reflections(mesh: Mesh, n_samples: int = 500, n_refine: int = 3, seed: 
             )
         )
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class ExtrinsicGroup:
+    """The rigid motions that some mirror planes generate, as vertex maps.
+
+    Args:
+        group: identity first, then the reflections in the planes, then the other elements.
+        orientation: ``(G,)`` +1 for rotations, -1 for reflections (of any kind).
+        residual: the largest root mean square distance from an image of the shape to the shape / sqrt(area).
+    """
+
+    group: SymmetryGroup
+    orientation: Float[Tensor, " G"]
+    residual: float
+
+
+def extrinsic_group(mesh: Mesh, planes: Sequence[ExtrinsicReflection], most: int = 120) -> ExtrinsicGroup:
+    """All products of the reflections in some planes; each is applied to the vertices as one rigid motion.
+
+    Args:
+        mesh: the shape.
+        planes: its mirror planes (:func:`find_reflections`).
+        most: elements at most.
+
+    Raises:
+        ValueError: the planes generate more than ``most`` elements: their angles are those of no finite group, or the
+            shape is a solid of revolution.
+    """
+    verts, mass = mesh.verts.numpy(), mesh.vertex_areas.numpy()
+    used = np.flatnonzero(mass > 0)
+    scale = float(mesh.area) ** 0.5
+    tree = cKDTree(verts[used])
+    motions = [(np.eye(3), np.zeros(3))]
+    maps, residuals = [np.arange(len(verts))], [0.0]
+    for plane in planes:
+        n = plane.normal.numpy()
+        motions.append((np.eye(3) - 2 * np.outer(n, n), 2 * plane.offset * n))
+        maps.append(plane.map.numpy())
+        residuals.append(plane.residual)
+    pairs = [(a, b) for a in range(1, len(motions)) for b in range(1, len(motions))]
+    while pairs:
+        a, b = pairs.pop(0)
+        turn = motions[a][0] @ motions[b][0]
+        if min(float(np.linalg.norm(turn - known)) for known, _ in motions) < 0.3:
+            continue
+        if len(motions) == most:
+            raise ValueError(
+                f"{mesh.label}: {len(planes)} mirror planes generate more than {most} elements; the angles between "
+                "them are those of no finite group"
+            )
+        left, _, right = np.linalg.svd(turn)
+        shift = motions[a][0] @ motions[b][1] + motions[a][1]
+        new = len(motions)
+        motions.append((left @ right, shift))
+        distance, partner = tree.query(verts @ motions[-1][0].T + shift, workers=-1)
+        maps.append(used[partner])
+        residuals.append(float(np.sqrt(mass @ np.asarray(distance) ** 2 / mass.sum())) / scale)
+        pairs += [(new, g) for g in range(1, new + 1)] + [(g, new) for g in range(1, new)]
+    orientation = torch.tensor([float(np.sign(np.linalg.det(turn))) for turn, _ in motions], dtype=torch.float64)
+    return ExtrinsicGroup(SymmetryGroup(torch.from_numpy(np.stack(maps))), orientation, max(residuals))
 
 
 class _Planes(NamedTuple):

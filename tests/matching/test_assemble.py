@@ -1,0 +1,232 @@
+"""torchqm.matching.assemble: two reflections make the whole group, half a reflection makes none, errors average out."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import torchqm.matching.assemble as module
+from torchqm.data.synthetic import creature
+from torchqm.fmap import nearest_isometry, p2p_to_fmap
+from torchqm.matching import MatchParameters, prepare
+from torchqm.matching.assemble import LIMIT, TORN, FunctionalGroup, assemble, synchronized, torn
+from torchqm.matching.proposals import Judge, Proposal, correlation
+from torchqm.matching.self_map import nearest_involution
+from torchqm.symmetry import group_fault, group_name
+
+FULL = MatchParameters(k_max=100)
+K = 98
+"""Where no cluster of the octopus's eigenvalues is cut."""
+
+
+class Exact:
+    """A creature at rest with the functional maps of its group: ``C delta_x = delta_g(x)``."""
+
+    def __init__(self, kind):
+        self.body = creature(kind, 1000)
+        self.shape = prepare(self.body.mesh, K)
+        self.judge = Judge(self.shape)
+        self.group = self.body.base_group
+        self.proposals = [self.proposal(g, o) for g, o in zip(self.group, self.body.orientation.tolist(), strict=True)]
+
+    def proposal(self, images, orientation, score=None):
+        fmap = p2p_to_fmap(images.argsort(), self.shape.basis, self.shape.basis)
+        undone = torch.equal(images[images], torch.arange(len(images)))
+        fmap = nearest_involution(fmap) if undone else nearest_isometry(fmap)
+        return Proposal(fmap, orientation, undone, self.judge.score(fmap, orientation) if score is None else score)
+
+    def order(self, g):
+        element, power, n = self.group[g], self.group[g], 1
+        while not torch.equal(power, self.group[0]):
+            power, n = element[power], n + 1
+        return n
+
+    def product(self, g, h):
+        """Number of ``g o h`` in the true group."""
+        wanted = self.group[g][self.group[h]]
+        return next(i for i, element in enumerate(self.group) if torch.equal(element, wanted))
+
+    def reflections(self):
+        return [g for g, o in enumerate(self.body.orientation.tolist()) if o < 0]
+
+    def numbers(self, found):
+        """Which true element each one of a group is."""
+        near = torch.tensor([[correlation(e.fmap, p.fmap) for p in self.proposals] for e in found.elements])
+        assert float(near.amax(1).min()) > 0.95
+        return near.argmax(1).tolist()
+
+    def half(self, g, axis, score=None):
+        """A reflection on one half of the body, the identity on the other: what mirrors the arms and not the legs."""
+        verts = self.shape.mesh.verts
+        side = verts[:, axis] > (verts[:, axis] * self.shape.basis.mass).sum()
+        assert torch.equal(side, side[self.group[g]])
+        images = torch.where(side, self.group[g], torch.arange(len(side)))
+        assert 0.2 < float((images != self.group[g]).double().mean()) < 0.8
+        return self.proposal(images, -1, score)
+
+
+@pytest.fixture(scope="module")
+def octopus():
+    return Exact("octopus")
+
+
+@pytest.fixture(scope="module")
+def biped():
+    return Exact("biped")
+
+
+@pytest.fixture(scope="module")
+def ellipsoid():
+    return Exact("ellipsoid")
+
+
+@pytest.fixture(scope="module")
+def whole(octopus):
+    """The group that two neighbouring reflections of the octopus generate."""
+    mirrors = octopus.reflections()
+    a, b = next((a, b) for a in mirrors for b in mirrors if octopus.order(octopus.product(a, b)) == 8)
+    return assemble([octopus.proposals[a], octopus.proposals[b]], octopus.judge, FULL)
+
+
+class TestAssemble:
+    def test_two_reflections_make_the_group_of_an_octopus(self, octopus, whole):
+        assert whole.order == 16
+        assert whole.tried == 0
+        assert group_fault(whole.products) is None
+        assert group_name(whole.products) == "D8"
+        numbers = octopus.numbers(whole)
+        assert numbers[0] == 0
+        assert sorted(numbers) == list(range(16))
+        for g in range(16):
+            for h in range(16):
+                assert numbers[int(whole.products[g, h])] == octopus.product(numbers[g], numbers[h])
+
+    def test_what_is_known_of_its_elements(self, octopus, whole):
+        assert torch.equal(whole.elements[0].fmap, torch.eye(K).double())
+        for number, element in zip(octopus.numbers(whole), whole.elements, strict=True):
+            assert element.orientation == int(octopus.body.orientation[number])
+            assert element.involution == (octopus.order(number) <= 2)
+            assert element.score < 0.05
+
+    def test_maps_that_are_there_are_taken(self, ellipsoid, monkeypatch):
+        """The products of an ellipsoid's elements are in the pool: nothing is refined, and no more is found."""
+        monkeypatch.setattr(module, "_refined", None)
+        found = assemble(ellipsoid.proposals[1:], ellipsoid.judge, FULL)
+        assert sorted(ellipsoid.numbers(found)) == list(range(8))
+        assert group_name(found.products) == "C2 x C2 x C2"
+
+    @pytest.mark.parametrize("generator", [1, 2, 3, 4, 7])
+    def test_one_rotation_makes_its_powers(self, octopus, generator):
+        found = assemble([octopus.proposals[generator]], octopus.judge, FULL)
+        assert found.order == octopus.order(generator)
+        assert group_name(found.products) == f"C{found.order}"
+
+    @pytest.mark.parametrize("score", [0.0, 0.02, None])
+    @pytest.mark.parametrize("axis", [1, 2])
+    def test_half_a_reflection_is_refused(self, biped, axis, score):
+        """Whatever its own score is, it tears the body."""
+        false = biped.half(1, axis, score)
+        found = assemble([biped.proposals[1], false], biped.judge, FULL)
+        assert found.order == 2
+        assert biped.numbers(found) == [0, 1]
+        assert found.tried == (score is not None)  # else its score is too large to try it
+        assert torch.equal(found.products, torch.tensor([[0, 1], [1, 0]]))
+
+    def test_half_a_reflection_does_not_keep_the_others_out(self, octopus):
+        cut, a, b = octopus.reflections()[:3]
+        false = octopus.half(cut, 1, 0.01)
+        found = assemble([octopus.proposals[a], false, octopus.proposals[b]], octopus.judge, FULL)
+        assert found.order == 2 * octopus.order(octopus.product(a, b))
+        octopus.numbers(found)
+
+    def test_products_that_are_no_symmetries_refuse_a_map(self, ellipsoid):
+        """A turn by 30 degrees of a body with three different axes: its powers are refined to something else or bad."""
+        turned = ellipsoid.proposals[1].fmap.clone()
+        plane = torch.tensor([[0.866, -0.5], [0.5, 0.866]]).double()
+        turned[1:3] = plane @ turned[1:3]
+        false = Proposal(nearest_isometry(turned), 1, False, 0.01)
+        good = ellipsoid.proposals[ellipsoid.reflections()[0]]
+        found = assemble([good, false], ellipsoid.judge, FULL)
+        assert set(ellipsoid.numbers(found)) <= set(range(8))
+
+    def test_the_score_decides_who_may_try(self, ellipsoid):
+        """3.5 times the best one, LIMIT at most."""
+        first, second = (ellipsoid.proposals[g] for g in ellipsoid.reflections()[:2])
+        for best, other, taken in (
+            (0.03, 0.104, True),
+            (0.03, 0.106, False),
+            (0.1, LIMIT - 0.001, True),
+            (0.1, LIMIT + 0.001, False),
+        ):
+            pool = [replace(first, score=best), replace(second, score=other)]
+            found = assemble(pool, ellipsoid.judge, FULL)
+            assert (found.order == 4) == taken
+
+    def test_a_best_map_that_is_no_symmetry_gives_no_group(self, biped):
+        """Its square is not the identity and no symmetry either."""
+        noise = torch.randn(K, K, generator=torch.Generator().manual_seed(0)).double()
+        found = assemble([Proposal(nearest_isometry(noise), 1, False, 0.3)], biped.judge, FULL)
+        assert (found.order, found.tried) == (1, 1)
+        assert found.products.tolist() == [[0]]
+
+
+class TestTorn:
+    def test_symmetries_tear_nothing(self, octopus, biped):
+        for exact in (octopus, biped):
+            assert {torn(exact.shape, p.fmap) for p in exact.proposals} == {0.0}
+
+    @pytest.mark.parametrize("axis", [1, 2])
+    def test_half_a_reflection_tears_along_a_line(self, biped, axis):
+        share = torn(biped.shape, biped.half(1, axis).fmap)
+        assert share < 0.15
+        assert TORN * share > 0.2 > LIMIT
+
+    def test_noise_tears_much(self, biped):
+        noise = torch.randn(K, K, generator=torch.Generator().manual_seed(0)).double()
+        assert torn(biped.shape, nearest_isometry(noise)) > 0.4
+
+
+def turned_by(angle, seed):
+    """A small rotation of all functions but the constant: a map and its errors."""
+    skew = torch.randn(K, K, generator=torch.Generator().manual_seed(seed)).double()
+    skew[0] = skew[:, 0] = 0
+    return torch.linalg.matrix_exp(angle * (skew - skew.T))
+
+
+class TestSynchronized:
+    @pytest.fixture
+    def exact(self, octopus):
+        table = torch.tensor([[octopus.product(g, h) for h in range(16)] for g in range(16)])
+        return FunctionalGroup(tuple(octopus.proposals), table, 3)
+
+    def test_an_exact_group_stays(self, exact):
+        found = synchronized(exact)
+        assert torch.equal(found.products, exact.products)
+        assert found.tried == 3
+        for new, old in zip(found.elements, exact.elements, strict=True):
+            torch.testing.assert_close(new.fmap, old.fmap, atol=1e-8, rtol=0)
+            assert (new.orientation, new.involution, new.score) == (old.orientation, old.involution, old.score)
+
+    def test_errors_average_out(self, exact):
+        """Each map comes nearer to the truth, by more than half, and products hold better."""
+        noisy = [exact.elements[0]]
+        noisy += [replace(e, fmap=turned_by(0.02, i) @ e.fmap) for i, e in enumerate(exact.elements[1:])]
+        before = replace(exact, elements=tuple(noisy))
+        after = synchronized(before)
+        assert torch.equal(after.elements[0].fmap, exact.elements[0].fmap)
+        for old, new, true in zip(before.elements[1:], after.elements[1:], exact.elements[1:], strict=True):
+            assert float((new.fmap - true.fmap).norm()) < 0.5 * float((old.fmap - true.fmap).norm())
+            torch.testing.assert_close(new.fmap @ new.fmap.T, torch.eye(K).double(), atol=1e-10, rtol=0)
+        assert self.closure(after) < 0.5 * self.closure(before)
+
+    @staticmethod
+    def closure(group):
+        maps = torch.stack([e.fmap for e in group.elements])
+        gaps = [maps[g] @ maps[h] - maps[group.products[g, h]] for g in range(16) for h in range(16)]
+        return float(torch.stack(gaps).norm())
+
+    def test_the_trivial_group(self, exact):
+        trivial = FunctionalGroup(exact.elements[:1], torch.zeros(1, 1, dtype=torch.int64))
+        found = synchronized(trivial)
+        assert found.order == 1
+        assert torch.equal(found.elements[0].fmap, trivial.elements[0].fmap)

@@ -1,0 +1,187 @@
+"""torchqm.matching.proposals: exact symmetries score 0 and are proposed, everything else scores worse."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from references.shapes import icosphere
+
+from torchqm.data.synthetic import creature
+from torchqm.fmap import p2p_to_fmap
+from torchqm.geometry import Mesh
+from torchqm.matching import MatchParameters, prepare
+from torchqm.matching.proposals import SAME, Judge, Proposal, correlation, different, grown, propose, regrown
+from torchqm.matching.self_map import nearest_involution, reflection_score
+
+FULL = MatchParameters(k_max=100)
+
+
+class Exact:
+    """A creature at rest with the functional maps of its group: ``C delta_x = delta_g(x)``."""
+
+    def __init__(self, kind, k=98):  # 98: no cluster of the octopus is cut
+        self.body = creature(kind, 1000)
+        self.shape = prepare(self.body.mesh, k)
+        basis = self.shape.basis
+        self.fmaps = [p2p_to_fmap(g.argsort(), basis, basis) for g in self.body.base_group]
+        self.orientation = self.body.orientation.tolist()
+        self.judge = Judge(self.shape)
+
+
+@pytest.fixture(scope="module")
+def ellipsoid():
+    return Exact("ellipsoid")
+
+
+@pytest.fixture(scope="module")
+def octopus():
+    return Exact("octopus")
+
+
+@pytest.fixture(scope="module")
+def biped():
+    return Exact("biped")
+
+
+def partial(exact, axis):
+    """The reflection on one half of the body, the identity on the other."""
+    verts = exact.shape.mesh.verts
+    mirror = exact.body.base_group[exact.orientation.index(-1)]
+    side = verts[:, axis] > (verts[:, axis] * exact.shape.basis.mass).sum()
+    assert torch.equal(side, side[mirror])
+    images = torch.where(side, mirror, torch.arange(len(side)))
+    return nearest_involution(p2p_to_fmap(images, exact.shape.basis, exact.shape.basis))
+
+
+def test_correlation_of_orthogonal_maps(octopus):
+    identity = torch.eye(98).double()
+    assert correlation(identity, identity) == pytest.approx(1)
+    assert correlation(identity, -identity) == pytest.approx(-1)
+    for i, one in enumerate(octopus.fmaps):
+        for j, other in enumerate(octopus.fmaps):
+            assert correlation(one, other) == pytest.approx(correlation(other, one), abs=1e-12)
+            assert correlation(one, other) == pytest.approx(1, abs=1e-6) if i == j else correlation(one, other) < 0.4
+
+
+def test_different_keeps_the_first_of_each_kind():
+    signs = [(1, 1, 1, 1), (1, 1, 1, -1), (-1, 1, 1, 1), (-1, -1, 1, 1), (1, 1, 1, 1)]
+    maps = [Proposal(torch.diag(torch.tensor(s).double()), 1, True, float(i)) for i, s in enumerate(signs)]
+    scores = {most: [p.score for p in different(maps, 9, most)] for most in (0.95, 0.5, 0.4, -1.1)}
+    assert scores == {0.95: [0, 1, 2, 3], 0.5: [0, 1, 2, 3], 0.4: [0, 3], -1.1: [0]}
+    assert [p.score for p in different(maps, 2)] == [0, 1]
+    assert different([], 3) == []
+
+
+@pytest.mark.parametrize("kind", ["ellipsoid", "octopus", "biped"])
+def test_reflections_turn_the_orientation_over_and_rotations_keep_it(kind, request):
+    """All elements: of the ellipsoid three reflections, three rotations, the point reflection."""
+    exact = request.getfixturevalue(kind)
+    for fmap, direct in zip(exact.fmaps, exact.orientation, strict=True):
+        assert exact.judge.orientation(fmap) == pytest.approx(direct, abs=0.02)
+
+
+def test_orientation_is_that_of_the_positions(ellipsoid):
+    """Which way each element moves the axes says whether it turns space over."""
+    verts = ellipsoid.shape.mesh.verts - ellipsoid.shape.mesh.verts.mean(0)
+    for element, fmap in zip(ellipsoid.body.base_group, ellipsoid.fmaps, strict=True):
+        signs = [float(torch.sign((verts[:, a] * verts[element, a]).sum())) for a in range(3)]
+        assert ellipsoid.judge.orientation(fmap) == pytest.approx(signs[0] * signs[1] * signs[2], abs=0.05)
+
+
+def test_few_triangles_are_enough(octopus):
+    thinned = Judge(octopus.shape, n_faces=octopus.shape.mesh.n_faces // 3)
+    for fmap, direct in zip(octopus.fmaps, octopus.orientation, strict=True):
+        assert thinned.orientation(fmap) * direct > 0.7
+
+
+def test_few_functions_are_enough(ellipsoid):
+    """Smaller than anything that the judge looks at, down to the first functions of the maps."""
+    for fmap, direct in zip(ellipsoid.fmaps, ellipsoid.orientation, strict=True):
+        assert ellipsoid.judge.orientation(fmap[:20, :20]) * direct > 0.9
+    small = Judge(prepare(ellipsoid.body.mesh, 10))
+    assert small.orientation(torch.eye(10).double()) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("kind", ["ellipsoid", "octopus", "biped"])
+def test_exact_symmetries_score_nothing(kind, request):
+    exact = request.getfixturevalue(kind)
+    for fmap, direct in zip(exact.fmaps[1:], exact.orientation[1:], strict=True):
+        assert exact.judge.score(fmap, direct) < 1e-6
+        # the wrong orientation: half of what -1 lacks to 0.5
+        assert exact.judge.score(fmap, -direct) == pytest.approx(0.75, abs=0.01)
+    assert exact.judge.score(exact.fmaps[0], 1) > 0.3  # the identity has too many even functions
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+def test_what_is_no_symmetry_scores_worse(biped, axis):
+    half = partial(biped, axis)
+    for orientation in (1, -1):
+        assert biped.judge.score(half, orientation) > 0.3
+    noise = torch.randn(98, 98, generator=torch.Generator().manual_seed(0)).double()
+    near = nearest_involution(biped.fmaps[1] + 0.02 * noise)
+    nearer = nearest_involution(biped.fmaps[1] + 0.01 * noise)
+    assert biped.judge.score(nearest_involution(noise), -1) > biped.judge.score(near, -1)
+    assert biped.judge.score(near, -1) > biped.judge.score(nearer, -1) > 0.01
+
+
+def test_without_orientation_nothing_is_said_of_it(ellipsoid):
+    judge = Judge(replace(ellipsoid.shape, oriented=False))
+    for fmap in ellipsoid.fmaps:
+        for orientation in (1, -1):
+            assert judge.score(fmap, orientation) == reflection_score(fmap, ellipsoid.shape)
+
+
+def test_grown_reaches_the_true_map(octopus):
+    """Also those that are no involutions, which only stay what they are if they are not made one."""
+    for g in (1, octopus.orientation.index(-1)):
+        wanted, direct = octopus.fmaps[g], octopus.orientation[g]
+        start = Proposal(wanted[:30, :30], direct, correlation(wanted @ wanted, torch.eye(98).double()) > 0.9)
+        found = grown(start, octopus.judge, FULL, 98, 1000, 3000)
+        assert found.fmap.shape == (98, 98)
+        assert correlation(found.fmap, wanted) > 0.97
+        assert found.score == octopus.judge.score(found.fmap, direct) < 0.05
+        assert (found.orientation, found.involution) == (direct, start.involution)
+        forced = grown(replace(start, involution=True), octopus.judge, FULL, 98, 1000, 3000)
+        assert (correlation(forced.fmap, wanted) < 0.5) == (not start.involution)
+
+
+def test_regrown_is_never_worse(biped):
+    """A map that is right in its low functions is made right in the others; a right one stays as it is."""
+    right = Proposal(biped.fmaps[1], -1, True, 0.0)
+    assert regrown(right, biped.judge, FULL) is right
+    spoilt = biped.fmaps[1].clone()
+    spoilt[50:, 50:] = torch.eye(48).double()
+    poor = Proposal(spoilt, -1, True, biped.judge.score(spoilt, -1))
+    better = regrown(poor, biped.judge, FULL)
+    assert better.score < 0.02 < poor.score
+    assert correlation(better.fmap, biped.fmaps[1]) > 0.97
+    hopeless = Proposal(-biped.fmaps[0], -1, True, float("-inf"))
+    assert regrown(hopeless, biped.judge, FULL) is hopeless
+
+
+def test_all_symmetries_of_an_ellipsoid_are_proposed(ellipsoid):
+    """Its seven elements come before everything else, each once, with the right orientation."""
+    pool = propose(ellipsoid.judge, FULL)
+    found = set()
+    for proposal in pool[:7]:
+        near = [correlation(proposal.fmap, fmap) for fmap in ellipsoid.fmaps]
+        g = near.index(max(near))
+        assert near[g] > 0.95
+        assert proposal.orientation == ellipsoid.orientation[g]
+        assert proposal.score < 0.05
+        found.add(g)
+    assert found == set(range(1, 8))
+    for i, one in enumerate(pool):
+        assert all(correlation(one.fmap, other.fmap) <= SAME for other in pool[:i])
+
+
+def test_signs_of_eigenfunctions_where_there_are_few_tips():
+    """A smooth ellipsoid has two tips; the signs of its first functions have the rest. Any number of functions will do,
+    also fewer than those in which landmarks are compared."""
+    ball = icosphere(3)
+    egg = prepare(Mesh(ball.verts * torch.tensor([1.0, 1.3, 1.7]).double(), ball.faces, "egg"), 60)
+    pool = propose(Judge(egg), MatchParameters(k=10, k_max=12))
+    assert {p.fmap.shape for p in pool} == {(12, 12)}
+    assert len(pool) >= 7
+    assert max(p.score for p in pool[:7]) < 1e-6
+    assert sorted(p.orientation for p in pool[:7]) == [-1, -1, -1, -1, 1, 1, 1]
