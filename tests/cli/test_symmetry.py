@@ -94,6 +94,22 @@ def test_from_the_spectrum_alone(files, tmp_path, capsys):
     assert float(gap.mean()) / rest.mesh.area**0.5 < 0.01
 
 
+def test_a_whole_group_goes_through_its_file_into_match(tmp_path, capsys):
+    body = creature("ellipsoid", 1000)
+    save_mesh(body.mesh, tmp_path / "egg.off")
+    egg, out = str(tmp_path / "egg.off"), tmp_path / "out"
+    assert main(["symmetry", egg, "--out", str(out), "--symmetry", "extrinsic", "--k-max", "60"]) == 0
+    assert "group: C2 x C2 x C2 (8 elements); found by: extrinsic" in capsys.readouterr().out
+    assert (out / "symmetry.png").stat().st_size > 10_000
+    file = str(out / "symmetry.npz")
+    options = ["--symmetry", file, "--symmetry-source", file, "--k-max", "100", "--no-picture"]
+    assert main(["match", egg, egg, *options, "--out", str(tmp_path / "match")]) == 0
+    maps = np.load(tmp_path / "match" / "match.npz")["maps"]
+    same = (maps[:, None] == body.base_group.numpy()).mean(2)
+    assert sorted(same.argmax(1).tolist()) == list(range(8))  # each element of the group once
+    assert same.max(1).min() > 0.9
+
+
 def test_picture(files, tmp_path, monkeypatch):
     monkeypatch.setattr("torchqm.viz.charts.DPI", 40)
     monkeypatch.setattr("torchqm.viz.render.REFINE_BELOW", 0)

@@ -141,7 +141,7 @@ def test_nothing_is_made_up():
 
 @pytest.mark.xfail(reason="of the infinitely many symmetries a finite group is taken, and nothing is said about it")
 def test_a_sphere_is_not_given_a_finite_group_without_a_warning():
-    """What comes out depends on the triangles: D5 on 162 vertices, D6 x C2 or D8 on 642, S4 x C2 on 2562."""
+    """What comes out depends on the triangles and the number of functions: D5 on 162 vertices, C2 to D8 on 642."""
     found = detect_group(prepare(icosphere(2), 60), MatchParameters(k_max=60))
     assert found.group.order == 1 or found.warnings
 

@@ -166,10 +166,6 @@ def read_symmetry(path: Path, mesh: "Mesh") -> tuple["Tensor", list[str]]:
         symmetry = load_symmetry(path, mesh)
     except SymmetryFileError as error:
         raise UserError(str(error)) from error
-    if len(symmetry.maps) > 2:
-        raise UserError(
-            f"{path}: {len(symmetry.maps)} symmetries; dense maps can be extracted for one reflection (2 rows) so far"
-        )
     return symmetry.maps, symmetry.notes
 
 

@@ -1,4 +1,4 @@
-"""``torchqm symmetry``: the reflection of one mesh."""
+"""``torchqm symmetry``: the symmetries of one mesh."""
 
 import argparse
 from pathlib import Path
@@ -25,7 +25,7 @@ __all__ = ["FILES", "add_parser", "run"]
 FILES = ("symmetry.npz", "summary.json", "symmetry.png")
 
 _DESCRIPTION = """\
-Find the reflection of a shape as a vertex map: from its own mirror plane if it stands in a
+Find the symmetries of a shape as vertex maps: from its own mirror planes if it stands in a
 symmetric pose, else from its spectrum (no reference, no landmarks); or by transfer from a
 reference, another pose of the same shape (section 6.1 of the paper)."""
 
@@ -42,7 +42,7 @@ def add_parser(commands: Any) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser(
         "symmetry",
-        help="the reflection of one mesh",
+        help="the symmetries of one mesh",
         description=_DESCRIPTION,
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -59,8 +59,8 @@ def add_parser(commands: Any) -> None:
         "--symmetry",
         choices=("auto", "extrinsic", "detect"),
         default="auto",
-        help="without a reference. auto (default): the mirror plane if it fits firmly, else from the spectrum; "
-        "extrinsic: mirror plane alone; detect: spectrum alone",
+        help="without a reference. auto (default): mirror planes if they fit firmly, else from the spectrum; "
+        "extrinsic: mirror planes alone; detect: spectrum alone",
     )
     parser.add_argument(
         "--method",
@@ -108,7 +108,9 @@ def run(arguments: argparse.Namespace) -> None:
         for number, (label, score) in enumerate(zip(result.labels, result.scores.tolist(), strict=True))
     ]
     print(format_table(["symmetry", "score"], rows))
-    print(f"found by: {result.origin}; score: how far from an isometry (0)\n")
+    order = len(result.labels)
+    group = f"group: {result.details['group']} ({order} element{'s' if order > 1 else ''}); "
+    print(f"{group}found by: {result.origin}; score: how far from an isometry (0)\n")
     print_seconds(result.seconds)
     print()
     print_warnings(result.warnings)

@@ -17,15 +17,12 @@ from torchqm.matching.parity import odd_halves
 from torchqm.matching.quality import orientation_agreement
 from torchqm.matching.self_map import nearest_involution
 from torchqm.matching.shape import PreparedShape
-from torchqm.matching.symmetry_file import reflection_fault, return_error
+from torchqm.matching.symmetry_file import closure_fault, reflection_fault, return_error
 from torchqm.matching.transfer import transfer_symmetry
 from torchqm.symmetry.algebra import group_name
 from torchqm.symmetry.extrinsic import ExtrinsicReflection, extrinsic_group, find_reflections
 from torchqm.symmetry.group import SymmetryGroup
 from torchqm.symmetry.leftright import halves_of_reflection
-
-MAX_CLOSURE = 0.1
-"""Mean distance / sqrt(area) between the product of two maps of a given group and the nearest of its maps, at most."""
 
 __all__ = [
     "KnownSymmetry",
@@ -150,7 +147,7 @@ def extrinsic_symmetry(shape: PreparedShape, max_residual: float = 0.02) -> Know
     if found.residual <= max_residual:
         planes = [found, *(plane for plane in more if plane.residual <= max_residual)]
         known = _reflection(shape, found)
-        return known if len(planes) == 1 else _several(shape, known, planes, max_residual)
+        return known if len(planes) == 1 or not found.convincing else _several(shape, known, planes, max_residual)
     text = f"{shape.mesh.label}: no mirror plane: the best one leaves a residual above {max_residual:g}"
     numbers, details = _numbers(found)
     none = no_symmetry(shape, [f"{text} ({numbers})"])
@@ -255,11 +252,7 @@ def given_symmetry(shape: PreparedShape, maps: Tensor, origin: str = "file") -> 
 
 def _given_group(shape: PreparedShape, group: SymmetryGroup, origin: str) -> KnownSymmetry:
     """A table of more than two maps, if it is closed under composition."""
-    residuals = group.residuals(shape.mesh.verts, shape.mesh.vertex_areas)
-    worst = max(residuals.closure, residuals.inverse)
-    fault = residuals.fault
-    if fault is None and worst > MAX_CLOSURE:
-        fault = f"products of two maps are {worst:.3f} sqrt(area) from the nearest map ({MAX_CLOSURE:g} is allowed)"
+    fault, residuals = closure_fault(shape.mesh, group)
     if fault is not None:
         raise MatchError(f"{shape.mesh.label}: the {group.order} maps of the symmetry are no group: {fault}")
     agreement = [orientation_agreement(shape.mesh, shape.mesh, row) if shape.oriented else 1.0 for row in group.maps]

@@ -52,13 +52,15 @@ def full_map_from_orbits(
     known_y: KnownSymmetry,
     parameters: MatchParameters,
     steps: int = 20,
+    n_starts: int = 12,
 ) -> OrbitMatch:
     """Choose one fundamental domain on each shape, match these, and extend the map to the whole.
 
     A generic point of x and any point of the orbit that it goes to are the centres of Dirichlet domains. What lies in
     the first domain of x goes to that point of its orbit that lies in the first domain of y. A functional map is fitted
     to these pairs, and then to all samples in turn with the choice, among the points of each orbit, that it makes
-    itself: a nearest-point search among |G| points.
+    itself: a nearest-point search among |G| points. From some domains this ends in a map that is direct here and
+    mirrored there; so several are tried, and the map that comes nearest to the orbits is kept.
 
     Args:
         match: the map between symmetric functions.
@@ -68,6 +70,7 @@ def full_map_from_orbits(
         known_y: that of y, with as many elements.
         parameters: ``k``, ``n_samples`` are used.
         steps: iterations of the choice.
+        n_starts: domains that are tried.
 
     Raises:
         ValueError: the groups have different orders.
@@ -79,35 +82,51 @@ def full_map_from_orbits(
         raise ValueError(f"groups of {known_x.group.order} and {known_y.group.order} elements: they must be the same")
     samples = x.samples[: parameters.n_samples]
     orbit_map = match.orbit_map(x, y)
-    points_x, points_y = _embedding(x.basis), _embedding(y.basis)
-    # The centre of a domain must be far from its own images, and so must the point that it goes to.
-    room = torch.minimum(
-        _separation(points_x, known_x.group.orbits[samples]),
-        _separation(points_y, known_y.group.orbits[orbit_map[samples]]),
-    )
-    start = int(samples[room.argmax()])
-    goal = int(orbit_map[start])
-    domains_x = fundamental_domains(known_x.group, points_x, x.basis.mass, start, known_x.products)
-    domains_y = fundamental_domains(known_y.group, points_y, y.basis.mass, goal, known_y.products)
     orbits = known_y.group.maps[:, orbit_map[samples]]
-    inside = domains_y.element[orbits] == 0
-    use = (domains_x.element[samples] == 0) & inside.any(0)
-    chosen = orbits.gather(0, inside.int().argmax(0)[None])[0]
+    points_x, points_y = _embedding(x.basis), _embedding(y.basis)
     k = basis_size([x.basis, y.basis], parameters.k)
     small_x, small_y = x.basis.truncate(k), y.basis.truncate(k)
     at_x, at_orbits = small_x.evecs[samples], small_y.evecs[orbits]
-    f, g = at_x[use].T, small_y.evecs[chosen[use]].T
-    fmap = nearest_isometry(solve_fmap(f, g, small_x.evals, small_y.evals, float(f.square().sum()) / k, ridge=1e-9))
+    # The centre of a domain must be far from its own images, and so must the point that it goes to.
+    room = torch.minimum(_separation(points_x, known_x.group.orbits[samples]), _separation(points_y, orbits.T))
+    found: list[OrbitMatch] = []
+    for number in _spread(points_x[samples], room, n_starts):
+        start, goal = int(samples[number]), int(orbit_map[samples[number]])
+        domains_x = fundamental_domains(known_x.group, points_x, x.basis.mass, start, known_x.products)
+        domains_y = fundamental_domains(known_y.group, points_y, y.basis.mass, goal, known_y.products)
+        inside = domains_y.element[orbits] == 0
+        use = (domains_x.element[samples] == 0) & inside.any(0)
+        chosen = orbits.gather(0, inside.int().argmax(0)[None])[0]
+        f, g = at_x[use].T, small_y.evecs[chosen[use]].T
+        weight = float(f.square().sum()) / k
+        fmap = nearest_isometry(solve_fmap(f, g, small_x.evals, small_y.evals, weight, ridge=1e-9))
+        fmap, residual = _fitted(fmap, at_x, at_orbits, steps)
+        found.append(OrbitMatch(fmap, (start, goal), residual))
+    return min(found, key=lambda one: one.residual)
+
+
+def _fitted(
+    fmap: Float[Tensor, "K K"], at_x: Float[Tensor, "S K"], at_orbits: Float[Tensor, "G S K"], steps: int
+) -> tuple[Float[Tensor, "K K"], float]:
+    """ICP in which a sample may only go to the points of its orbit; and how far it stays away from these."""
+    numbers = torch.arange(len(at_x))
     for _ in range(steps):
-        gaps = (at_orbits - at_x @ fmap.T).square().sum(2)
-        nearest = gaps.argmin(0)
-        last, points = fmap, at_orbits[nearest, torch.arange(len(samples))]
-        fmap = nearest_isometry(points.T @ at_x)
+        nearest = (at_orbits - at_x @ fmap.T).square().sum(2).argmin(0)
+        last, fmap = fmap, nearest_isometry(at_orbits[nearest, numbers].T @ at_x)
         if float((fmap - last).norm()) < 1e-3 * float(fmap.norm()):
             break
     gaps = (at_orbits - at_x @ fmap.T).square().sum(2)
-    residual = float((gaps.amin(0).mean() / gaps.mean().clamp_min(1e-300)).sqrt())
-    return OrbitMatch(fmap, (start, goal), residual)
+    return fmap, float((gaps.amin(0).mean() / gaps.mean().clamp_min(1e-300)).sqrt())
+
+
+def _spread(places: Float[Tensor, "S D"], room: Float[Tensor, " S"], n: int) -> list[int]:
+    """Up to n samples with much room, not close to each other: each is best in room times distance to those before."""
+    chosen = [int(room.argmax())]
+    distance = (places - places[chosen[0]]).norm(dim=1)
+    while len(chosen) < min(n, len(room)):
+        chosen.append(int((room * distance).argmax()))
+        distance = torch.minimum(distance, (places - places[chosen[-1]]).norm(dim=1))
+    return chosen
 
 
 def _embedding(basis: SpectralBasis) -> Float[Tensor, "V D"]:

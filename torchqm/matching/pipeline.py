@@ -88,7 +88,7 @@ def find_symmetry(
     method: str = "quotient",
     symmetry: str = "auto",
 ) -> SymmetryResult:
-    """The reflection of a shape: from its own mirror plane or spectrum, or transferred from an undeformed reference.
+    """The symmetries of a shape: from its own mirror planes or spectrum, or transferred from an undeformed reference.
 
     Args:
         mesh: the shape.
@@ -96,11 +96,12 @@ def find_symmetry(
         parameters: of the matching.
         listener: told of each step.
         method: whose way of transfer: ``quotient`` or ``paper``.
-        symmetry: without a reference: ``auto`` (the mirror plane if it fits firmly, else the spectrum), ``extrinsic``
-            (mirror plane alone) or ``detect`` (spectrum alone).
+        symmetry: without a reference: ``auto`` (mirror planes if they fit firmly, else the spectrum), ``extrinsic``
+            (mirror planes alone) or ``detect`` (spectrum alone).
 
     Returns:
-        The group; trivial, with a warning that gives the numbers, if no reflection was found.
+        The group, its name in ``details["group"]``; trivial, with a warning that gives the numbers, if nothing was
+        found.
     """
     if symmetry not in SYMMETRIES[:3]:
         raise ValueError(f"symmetry={symmetry!r}: allowed are {', '.join(SYMMETRIES[:3])}")
@@ -120,14 +121,14 @@ def find_symmetry(
         [*shape.warnings, *known.warnings],
         collection.parameters.as_dict(),
         dict(collection.steps.seconds),
-        {**known.details, "orientation": agreement},
+        {**known.details, "group": known.name, "orientation": agreement},
     )
 
 
 def detect_symmetry(
     mesh: Mesh | str | Path, *, parameters: MatchParameters | None = None, listener: StepListener | None = None
 ) -> SymmetryResult:
-    """The reflection of a shape from its own spectrum: no reference, no mirror plane, no landmarks.
+    """The symmetries of a shape from its own spectrum: no reference, no mirror plane, no landmarks.
 
     Args:
         mesh: the shape.

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchqm.fmap.convert import nearest_used
 from torchqm.fmap.refine import nearest_isometry
 from torchqm.matching.landmark_maps import LandmarkMaps
 from torchqm.matching.parameters import MatchParameters
@@ -17,7 +18,7 @@ from torchqm.spectral.descriptors import wave_energies, wave_kernel_signature
 from torchqm.symmetry.landmarks import find_landmarks, landmark_permutations
 from torchqm.symmetry.orientation import function_pairs, orientation_form
 
-__all__ = ["SAME", "Judge", "Proposal", "correlation", "different", "grown", "propose", "regrown"]
+__all__ = ["SAME", "Judge", "Proposal", "correlation", "different", "distortion", "grown", "propose", "regrown"]
 
 VARIANTS: tuple[tuple[int, tuple[float, ...], tuple[tuple[float, float, float], ...]], ...] = (
     (60, (1.0, 2.0), ((0.1, 1.0, 1.0), (0.1, 0.3, 1.0))),
@@ -29,6 +30,9 @@ best on all shapes; these four together had the best candidates on the harder on
 
 FIRST, SECOND, CHOICE = 40, 60, 100
 """Functions at which all maps, the better ones, and the best ones are compared."""
+
+CLOSE, DISTORTED = 1.35, 0.5
+"""Maps with up to this multiple of the best score are ranked by how they change distances, too, with this weight."""
 
 FEW = 40
 """Proposals from landmarks below which signs of eigenfunctions are tried, too: an egg has two tips."""
@@ -161,9 +165,42 @@ def propose(
     pool = sorted((grown(p, judge, parameters, CHOICE, 1000, 3000) for p in kept), key=_by_score)
     limit = 2.0 * pool[0].score if pool else 0.0
     pool = [regrown(p, judge, parameters) if p.score <= limit or i < 3 else p for i, p in enumerate(pool)]
-    # Of a person, what turns front to back can look nearly as good as what mirrors left and right.
-    pool.sort(key=lambda p: p.score * (1.3 if p.orientation > 0 else 1.0))
-    return different(pool, len(pool), SAME)
+    return different(_ranked(pool, judge.x), len(pool), SAME)
+
+
+def _ranked(pool: list[Proposal], x: PreparedShape) -> list[Proposal]:
+    """By score; those that are close to the best one by how much they change distances, too.
+
+    Commutativity alone does not see that a map joins the halves of two symmetries; distances across the shape do. Of a
+    person, what turns front to back can look nearly as good as what mirrors left and right.
+    """
+    limit = CLOSE * min((p.score for p in pool), default=0.0)
+
+    def key(proposal: Proposal) -> float:
+        more = DISTORTED * distortion(x, proposal.fmap) if proposal.score <= limit else DISTORTED
+        return proposal.score * (1.3 if proposal.orientation > 0 else 1.0) + more
+
+    return sorted(pool, key=key)
+
+
+def distortion(x: PreparedShape, fmap: Float[Tensor, "K K"], n: int = 1000) -> float:
+    """Mean change of the biharmonic distance between two samples under a self-map, relative to the mean distance.
+
+    Args:
+        x: the shape.
+        fmap: in its first K functions.
+        n: samples; each is compared with two others, far apart in their (random) order.
+    """
+    basis, samples = x.basis.truncate(fmap.shape[0]), x.samples[:n]
+    partners = x.anchors[nearest_used(basis.evecs[samples] @ fmap.T, basis.restricted(x.anchors))]
+    small = x.basis.truncate(min(100, x.basis.k))
+    places = small.evecs[:, 1:] / small.evals[1:].clamp_min(torch.finfo(small.evals.dtype).tiny)
+    before, after = places[samples], places[partners]
+    gaps = []
+    for step in (len(samples) // 3, len(samples) // 2 + 1):
+        gaps.append(((before - before.roll(step, 0)).norm(dim=1), (after - after.roll(step, 0)).norm(dim=1)))
+    change = sum(float((b - a).abs().mean()) for b, a in gaps)
+    return change / max(sum(float(b.mean()) for b, _ in gaps), 1e-300)
 
 
 def _by_score(proposal: Proposal) -> float:

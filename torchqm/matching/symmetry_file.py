@@ -13,8 +13,17 @@ from torch import Tensor
 from torchqm.geometry.check import orient_faces
 from torchqm.geometry.mesh import Mesh
 from torchqm.matching.quality import orientation_agreement
+from torchqm.symmetry.group import GroupResiduals, SymmetryGroup
 
-__all__ = ["MAX_RETURN_ERROR", "SymmetryFile", "SymmetryFileError", "load_symmetry", "reflection_fault", "return_error"]
+__all__ = [
+    "MAX_RETURN_ERROR",
+    "SymmetryFile",
+    "SymmetryFileError",
+    "closure_fault",
+    "load_symmetry",
+    "reflection_fault",
+    "return_error",
+]
 
 MAX_RETURN_ERROR = 0.1
 """A reflection applied twice must bring points back to within this on average, in units of sqrt(area)."""
@@ -82,6 +91,25 @@ def reflection_fault(mesh: Mesh, reflection: Int[Tensor, " V"]) -> str | None:
     return None
 
 
+def closure_fault(mesh: Mesh, group: SymmetryGroup) -> tuple[str | None, GroupResiduals]:
+    """What speaks against a table of vertex maps being a group, with the numbers; and its residuals.
+
+    Args:
+        mesh: the shape, any scale.
+        group: the table.
+    """
+    unit = mesh.normalized()
+    residuals = group.residuals(unit.verts, unit.vertex_areas)
+    worst = max(residuals.closure, residuals.inverse)
+    fault = residuals.fault
+    if fault is None and worst > MAX_RETURN_ERROR:
+        fault = (
+            f"products of two maps are up to {worst:.3f} sqrt(area) from the nearest map on average "
+            f"({MAX_RETURN_ERROR:g} is allowed)"
+        )
+    return fault, residuals
+
+
 def load_symmetry(path: str | Path, mesh: Mesh) -> SymmetryFile:
     """Read the symmetry of a mesh from a file.
 
@@ -120,6 +148,10 @@ def load_symmetry(path: str | Path, mesh: Mesh) -> SymmetryFile:
     maps = torch.from_numpy(np.ascontiguousarray(table))
     for row in range(1, len(maps)):
         notes += _check_row(path, mesh, maps[row], row, len(maps))
+    if len(maps) > 2:
+        fault, _ = closure_fault(mesh, SymmetryGroup(maps))
+        if fault is not None:
+            raise SymmetryFileError(f"{path}: the {len(maps)} maps are no group: {fault}")
     return SymmetryFile(maps, notes)
 
 

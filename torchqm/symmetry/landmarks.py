@@ -229,7 +229,7 @@ def landmark_permutations(
 
     Args:
         landmarks: of the shape.
-        most: permutations that come back.
+        most: permutations that come back, besides those that ``both`` adds at the end.
         rtol_height: two landmarks whose heights differ by more (natural logarithm) are not exchanged.
         rtol_distance: change of a distance, relative to the mean of itself and the average, that ends a permutation.
         width: partial permutations kept at each step, for each orientation.
@@ -272,13 +272,7 @@ def landmark_permutations(
             for images, value in zip(chosen.tolist(), cost.tolist(), strict=True)
         ]
     found.sort(key=lambda p: p.cost)
-    first = [
-        p for p in found[:both] if LandmarkPermutation(p.images, -p.orientation, 0.0) not in map(_free, found[:most])
-    ]
-    found = found[:most] + [LandmarkPermutation(p.images, -p.orientation, p.cost) for p in first]
-    return [p for p in found if not p.trivial]
-
-
-def _free(permutation: LandmarkPermutation) -> LandmarkPermutation:
-    """The permutation without its cost."""
-    return LandmarkPermutation(permutation.images, permutation.orientation, 0.0)
+    kept = found[:most]
+    known = {(p.images, p.orientation) for p in kept}
+    turned = [LandmarkPermutation(p.images, -p.orientation, p.cost) for p in found[:both]]
+    return [p for p in [*kept, *(t for t in turned if (t.images, t.orientation) not in known)] if not p.trivial]
