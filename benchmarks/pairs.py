@@ -5,10 +5,10 @@
 
 No reference, no mirror plane, no landmark, no flip forgiven. Errors are geodesic / sqrt(area of the target) at 50
 spread points a class; that of a symmetry is measured against the mirror plane of the undeformed shape (gorillas have
-none, and no row). --paper N runs the paper's own pipeline (which needs the undeformed shape and its plane) on the first N
-pairs of each class, for its time on the same machine. --samples-only names classes whose true distances are computed at
-these points alone, not at the landmarks that other benchmarks keep in the same cache; --functions: eigenpairs (the paper's
-pipeline needs 300, torchqm uses 200). Seconds are without eigenpairs. Writes benchmarks/results/pairs.json.
+none, and no row). --paper N runs the paper's own pipeline (which needs the undeformed shape and its plane) on the first
+N pairs of each class, for its time on the same machine. --samples-only names classes whose true distances are computed
+at these points alone, not at the landmarks that other benchmarks keep in the same cache; --functions: eigenpairs (the
+paper's pipeline needs 300, torchqm uses 200). Seconds are without eigenpairs. Writes benchmarks/results/pairs.json.
 """
 
 import argparse

@@ -417,6 +417,21 @@ class TestEqualEigenvalues:
 
 
 class TestOrientation:
+    @pytest.mark.parametrize(
+        ("agreement", "cosine", "label"),
+        [
+            (0.8, 0.9, "direct"),
+            (-0.8, -0.9, "mirrored"),
+            (0.8, -0.9, "direct"),  # the triangles speak clearly
+            (0.2, 0.8, "direct"),
+            (-0.2, -0.8, "mirrored"),
+            (0.2, -0.8, "unknown"),  # the two disagree
+            (0.2, 0.3, "unknown"),
+        ],
+    )
+    def test_labels(self, agreement, cosine, label):
+        assert prepared.map_label(agreement, cosine) == label
+
     def test_what_cannot_be_told_apart_is_unknown(self, monkeypatch):
         shape, copy = blob_meshes()
         monkeypatch.setattr(prepared, "orientation_agreement", lambda *_: 0.2)

@@ -1,5 +1,8 @@
 """torchqm.symmetry.extrinsic: exact mirror planes are found wherever they lie, and none is made up."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +12,7 @@ from scipy.spatial import cKDTree
 from torchqm.data.synthetic import creature, exact_maps
 from torchqm.geometry import Mesh
 from torchqm.symmetry import SymmetryGroup, find_reflection, find_reflections
-from torchqm.symmetry.extrinsic import _images, _Planes, _reflective_icp
+from torchqm.symmetry.extrinsic import _images, _Planes, _reflective_icp, extrinsic_group
 from torchqm.testing import assert_orbit_equal
 
 
@@ -133,3 +136,25 @@ def test_mirror_images_of_two_planes_are_all_those_of_the_dihedral_group():
     turns = np.sort(np.degrees(np.arctan2(every[:, 1], every[:, 0])) % 180)
     np.testing.assert_allclose(np.diff(turns), 36, atol=1e-9)
     np.testing.assert_allclose(images.offsets, images.normals @ point, atol=1e-12)
+
+
+def test_planes_generate_their_group(prism):
+    planes = find_reflections(prism.mesh)
+    found = extrinsic_group(prism.mesh, planes)
+    assert found.group.order == 16
+    assert found.residual < 1e-9
+    rows = {tuple(row) for row in prism.group.maps.tolist()}
+    assert {tuple(row) for row in found.group.maps.tolist()} == rows
+    assert int((found.orientation < 0).sum()) == 8
+    assert found.group.residuals(prism.mesh.verts).name == "D4 x C2"
+    alone = extrinsic_group(prism.mesh, planes[:1])
+    assert alone.group.order == 2
+    assert alone.orientation.tolist() == [1, -1]
+
+
+def test_planes_of_no_finite_group_are_refused(prism):
+    planes = find_reflections(prism.mesh)
+    turned = torch.tensor([math.cos(1.0), math.sin(1.0), 0.0], dtype=torch.float64)  # an angle that is no part of pi
+    upright = replace(planes[0], normal=torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), offset=0.0)
+    with pytest.raises(ValueError, match="generate more than 12 elements"):
+        extrinsic_group(prism.mesh, [upright, replace(upright, normal=turned)], most=12)

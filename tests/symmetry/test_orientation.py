@@ -1,5 +1,6 @@
 """torchqm.symmetry.orientation: exact integrals, signs under reflections and flipped faces."""
 
+from dataclasses import replace
 from math import pi
 
 import pytest
@@ -8,7 +9,14 @@ from references.dense import orientation_coefficients as slow_coefficients
 from references.shapes import basis_of, icosphere, rotation
 
 from torchqm.geometry import Mesh
-from torchqm.symmetry import function_pairs, orientation_coefficients, orientation_form, symmetrized_basis
+from torchqm.symmetry import (
+    function_pairs,
+    orientation_coefficients,
+    orientation_cosine,
+    orientation_form,
+    orientation_tensor,
+    symmetrized_basis,
+)
 
 PAIR = torch.tensor([[0], [1]])
 
@@ -78,3 +86,31 @@ def test_symmetric_functions_give_odd_ones(mirror_blob):
     assert on_odd.abs().max() > 0.1
     mirrored = orientation_coefficients(mesh, split.even.evecs, pairs, split.odd.evecs[group.maps[1]])
     torch.testing.assert_close(mirrored, -on_odd, atol=1e-8, rtol=0)
+
+
+def test_the_tensor_is_the_form_of_all_pairs(blob):
+    basis = basis_of(blob.mesh, 12)
+    omega = orientation_tensor(blob.mesh, basis, n=6, k=9)
+    assert omega.shape == (9, 6, 6)
+    pairs = function_pairs(6)
+    wanted = orientation_coefficients(blob.mesh, basis.evecs[:, :6], pairs, basis.evecs[:, :9])
+    assert torch.allclose(omega[:, pairs[0], pairs[1]], wanted, atol=1e-12)
+    assert torch.equal(omega, -omega.transpose(1, 2))
+
+
+def test_cosines_of_exact_symmetries(prism):
+    """Also on every fourth triangle only, and between a shape and its mirror image."""
+    basis = basis_of(prism.mesh, 40)
+    whole = orientation_tensor(prism.mesh, basis)
+    few = orientation_tensor(prism.mesh, basis, n_faces=prism.mesh.n_faces // 4)
+    verts = prism.mesh.verts - prism.mesh.verts.mean(0)
+    for element in prism.group.maps:
+        turn = torch.linalg.lstsq(verts, verts[element]).solution
+        sign = round(float(torch.linalg.det(turn)))
+        fmap = basis.coefficients(basis.evecs[element]).T  # push-forward: the transpose of the pull-back
+        assert orientation_cosine(fmap, whole, whole) == pytest.approx(sign, abs=1e-6)
+        assert orientation_cosine(fmap, few, few) * sign > 0.5
+    inside_out = replace(prism.mesh, faces=prism.mesh.faces.flip(1))
+    other = orientation_tensor(inside_out, basis)
+    identity = torch.eye(40, dtype=torch.float64)
+    assert orientation_cosine(identity, whole, other) == pytest.approx(-1)

@@ -24,8 +24,9 @@ from torchqm.matching.semi_quotient import match_semi_quotient
 from torchqm.matching.shape import PreparedShape
 from torchqm.matching.steps import Steps
 from torchqm.matching.subgroups import common_symmetry, one_reflection
+from torchqm.symmetry.orientation import orientation_cosine, orientation_tensor
 
-__all__ = ["COST", "POOR_SCORE", "match_prepared", "orientation_label"]
+__all__ = ["COST", "POOR_SCORE", "map_label", "match_prepared", "orientation_label"]
 
 POOR_SCORE = 0.15
 """Commutativity score above which a map is called poor; true maps of TOSCA have 0.03 (wolf) to 0.13 (cat)."""
@@ -117,7 +118,14 @@ def match_prepared(
             fmap = correspondence_fmap(p2p, x.basis.truncate(k), y.basis.truncate(k), x.samples)
         maps = known_y.group.maps[:, p2p]
         agreement = [orientation_agreement(x.mesh, y.mesh, m) for m in maps]
-        labels = [orientation_label(a) if oriented else "unknown" for a in agreement]
+        basis_y = y.basis.truncate(fmap.shape[0])
+        fmaps = torch.stack([p2p_to_fmap(m, basis_y, basis_y) @ fmap for m in known_y.group.maps])
+        labels = ["unknown"] * len(maps)
+        if oriented:
+            omega_x, omega_y = (orientation_tensor(shape.mesh, shape.basis) for shape in (x, y))
+            smooth = [orientation_cosine(c, omega_x, omega_y) for c in fmaps]
+            details |= {"orientation_cosines": smooth}
+            labels = [map_label(a, c) for a, c in zip(agreement, smooth, strict=True)]
         if not oriented:
             warnings.append("a mesh is not consistently orientable: direct and mirrored cannot be told apart")
         elif separated is False or "unknown" in labels:
@@ -127,8 +135,6 @@ def match_prepared(
                 f"direct and mirrored are not told apart: orientation agreement {[round(a, 2) for a in agreement]}"
                 + (f", residuals {numbers}" if numbers else "")
             )
-        basis_y = y.basis.truncate(fmap.shape[0])
-        fmaps = torch.stack([p2p_to_fmap(m, basis_y, basis_y) @ fmap for m in known_y.group.maps])
         scores = torch.tensor([commutativity_score(m, x.basis, y.basis) for m in maps], dtype=torch.float64)
         if float(scores.min()) > POOR_SCORE:
             warnings.append(
@@ -165,6 +171,21 @@ def _spectrum_warning(shape: PreparedShape, k: int, rtol: float = 1e-3, most: fl
         f"{shape.mesh.label}: ambiguous spectrum: {equal} of the first {k} eigenvalues equal their neighbour to "
         f"{rtol:g}; the shape has more symmetry than one reflection, and which functions belong together is arbitrary"
     )
+
+
+def map_label(agreement: float, cosine: float) -> str:
+    """Name of a map: by its triangles if they say it clearly, else by how it carries smooth functions.
+
+    Triangles smaller than the errors of a map are turned over here and there even if the map is right everywhere.
+
+    Args:
+        agreement: :func:`torchqm.matching.quality.orientation_agreement`.
+        cosine: :func:`torchqm.symmetry.orientation.orientation_cosine`.
+    """
+    label = orientation_label(agreement)
+    if label == "unknown" and abs(cosine) > 0.5 and agreement * cosine > 0:
+        return "direct" if cosine > 0 else "mirrored"
+    return label
 
 
 def orientation_label(agreement: float) -> str:

@@ -16,7 +16,7 @@ from torchqm.matching.self_map import grow_self_map, nearest_involution, reflect
 from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.descriptors import wave_energies, wave_kernel_signature
 from torchqm.symmetry.landmarks import find_landmarks, landmark_permutations
-from torchqm.symmetry.orientation import function_pairs, orientation_form
+from torchqm.symmetry.orientation import orientation_cosine, orientation_tensor
 
 __all__ = ["SAME", "Judge", "Proposal", "correlation", "different", "distortion", "grown", "propose", "regrown"]
 
@@ -80,36 +80,18 @@ def different(proposals: Sequence[Proposal], n: int, most: float = 0.95) -> list
 class Judge:
     """What speaks against a self-map: :func:`torchqm.matching.self_map.reflection_score`, and wrong orientation.
 
-    ``<phi_k, omega(phi_a, phi_b)>`` is computed once, on every n-th triangle only, as what is compared is smooth and
-    only its sign and rough size matter; for a map there is nothing left to do on the mesh.
-
     Args:
         x: the shape.
-        n_functions: how many low functions are paired.
-        n_images: functions in which their images are written.
-        k: functions in which ``omega`` is.
-        n_faces: about how many triangles are used.
+        n_faces: about how many triangles are used (:func:`torchqm.symmetry.orientation.orientation_tensor`).
     """
 
-    def __init__(
-        self, x: PreparedShape, n_functions: int = 8, n_images: int = 24, k: int = 60, n_faces: int = 8000
-    ) -> None:
-        self.x, self.k, self.n_images = x, min(k, x.basis.k), min(n_images, x.basis.k)
-        mesh = replace(x.mesh, faces=x.mesh.faces[:: max(1, x.mesh.n_faces // n_faces)])
-        self.n = min(n_functions, self.n_images)
-        a, b = pairs = function_pairs(self.n_images)
-        form = orientation_form(mesh, x.basis.evecs[:, : self.n_images], pairs)
-        found = x.basis.evecs[:, : self.k][mesh.faces].mean(1).T @ form
-        self.omega = found.new_zeros(self.k, self.n_images, self.n_images)
-        self.omega[:, a, b], self.omega[:, b, a] = found, -found
+    def __init__(self, x: PreparedShape, n_faces: int = 8000) -> None:
+        self.x = x
+        self.omega = orientation_tensor(x.mesh, x.basis, n_faces=n_faces)
 
     def orientation(self, fmap: Float[Tensor, "K K"]) -> float:
         """Cosine between the images of ``omega(f, g)`` and ``omega(C f, C g)``; 1: a rotation, -1: a reflection."""
-        k, m, n = min(self.k, fmap.shape[0]), min(self.n_images, fmap.shape[0]), min(self.n, fmap.shape[0])
-        images = fmap[:m, :n]
-        found = torch.einsum("kpq,pa,qb->kab", self.omega[:k, :m, :m], images, images)
-        wanted = torch.einsum("jk,kab->jab", fmap[:k, :k], self.omega[:k, :n, :n])
-        return float((wanted * found).sum() / (wanted.norm() * found.norm()).clamp_min(1e-300))
+        return orientation_cosine(fmap, self.omega, self.omega)
 
     def score(self, fmap: Float[Tensor, "K K"], orientation: int) -> float:
         """0 for a symmetry; half of what the cosine lacks to 0.5 in the right direction is added."""

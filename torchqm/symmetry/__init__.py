@@ -12,14 +12,27 @@ from torchqm.symmetry.algebra import (
 )
 from torchqm.symmetry.basis import SymmetrizedBasis, split_by_projector, symmetrized_basis
 from torchqm.symmetry.domains import FundamentalDomains, fundamental_domains
-from torchqm.symmetry.extrinsic import ExtrinsicReflection, find_reflection, find_reflections
+from torchqm.symmetry.extrinsic import (
+    ExtrinsicGroup,
+    ExtrinsicReflection,
+    extrinsic_group,
+    find_reflection,
+    find_reflections,
+)
 from torchqm.symmetry.group import GroupResiduals, SymmetryGroup, common_order
 from torchqm.symmetry.irreducible import IsotypicComponent, isotypic_components
 from torchqm.symmetry.leftright import LeftRight, displacement, halves_of_reflection, persistence_clusters
-from torchqm.symmetry.orientation import function_pairs, orientation_coefficients, orientation_form
+from torchqm.symmetry.orientation import (
+    function_pairs,
+    orientation_coefficients,
+    orientation_cosine,
+    orientation_form,
+    orientation_tensor,
+)
 from torchqm.symmetry.projection import even_part, odd_part, projection_matrix
 
 __all__ = [
+    "ExtrinsicGroup",
     "ExtrinsicReflection",
     "FundamentalDomains",
     "GroupResiduals",
@@ -33,6 +46,7 @@ __all__ = [
     "displacement",
     "element_orders",
     "even_part",
+    "extrinsic_group",
     "find_reflection",
     "find_reflections",
     "function_pairs",
@@ -44,7 +58,9 @@ __all__ = [
     "isotypic_components",
     "odd_part",
     "orientation_coefficients",
+    "orientation_cosine",
     "orientation_form",
+    "orientation_tensor",
     "persistence_clusters",
     "projection_matrix",
     "real_degrees",

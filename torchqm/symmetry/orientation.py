@@ -4,13 +4,22 @@
 Intrinsic descriptors say nothing about the odd half of a map; once the even half is known, these functions do.
 """
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.geometry.mesh import Mesh
+from torchqm.spectral.basis import SpectralBasis
 
-__all__ = ["function_pairs", "orientation_coefficients", "orientation_form"]
+__all__ = [
+    "function_pairs",
+    "orientation_coefficients",
+    "orientation_cosine",
+    "orientation_form",
+    "orientation_tensor",
+]
 
 
 def function_pairs(n: int) -> Int[Tensor, "2 P"]:
@@ -65,3 +74,48 @@ def orientation_coefficients(
     for corner in range(3):
         at_vertices.index_add_(0, mesh.faces[:, corner], form / 3)
     return evecs.T @ at_vertices
+
+
+def orientation_tensor(
+    mesh: Mesh, basis: SpectralBasis, n: int = 24, k: int = 60, n_faces: int = 8000
+) -> Float[Tensor, "K N N"]:
+    """``<phi_k, omega(phi_a, phi_b)>`` for the first functions of a basis: with it, ``omega`` is mere linear algebra.
+
+    Args:
+        mesh: consistently oriented.
+        basis: its eigenfunctions.
+        n: functions that are paired, at most.
+        k: functions in which ``omega`` is written, at most.
+        n_faces: about how many triangles are used, evenly: what is compared is smooth.
+    """
+    n, k = min(n, basis.k), min(k, basis.k)
+    few = replace(mesh, faces=mesh.faces[:: max(1, mesh.n_faces // n_faces)])
+    a, b = pairs = function_pairs(n)
+    form = orientation_form(few, basis.evecs[:, :n], pairs) * (mesh.n_faces / max(few.n_faces, 1))
+    found = basis.evecs[:, :k][few.faces].mean(1).T @ form
+    omega = found.new_zeros(k, n, n)
+    omega[:, a, b], omega[:, b, a] = found, -found
+    return omega
+
+
+def orientation_cosine(
+    fmap_xy: Float[Tensor, "Ky Kx"],
+    omega_x: Float[Tensor, "K N N"],
+    omega_y: Float[Tensor, "L M M"],
+    n_functions: int = 8,
+) -> float:
+    """Cosine between ``C omega(f, g)`` and ``omega(C f, C g)``, f and g low functions; 1: direct, -1: mirrored.
+
+    Args:
+        fmap_xy: takes functions on x to functions on y.
+        omega_x: :func:`orientation_tensor` of x.
+        omega_y: that of y.
+        n_functions: how many low functions of x are paired.
+    """
+    (k, n, _), (last, m, _) = omega_x.shape, omega_y.shape
+    n, k = min(n, n_functions, fmap_xy.shape[1]), min(k, fmap_xy.shape[1])
+    m, last = min(m, fmap_xy.shape[0]), min(last, fmap_xy.shape[0])
+    images = fmap_xy[:m, :n]
+    found = torch.einsum("kpq,pa,qb->kab", omega_y[:last, :m, :m], images, images)
+    wanted = torch.einsum("jk,kab->jab", fmap_xy[:last, :k], omega_x[:k, :n, :n])
+    return float((wanted * found).sum() / (wanted.norm() * found.norm()).clamp_min(1e-300))
