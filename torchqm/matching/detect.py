@@ -26,6 +26,10 @@ SYMMETRIC, ASYMMETRIC = (0.15, 0.13), (0.2, 0.145)
 """Score of the best candidate, and commutativity of its vertex map, up to which it is a symmetry; and above which it is
 none."""
 
+LARGEST_IRREDUCIBLE = 5
+"""Dimension of the largest irreducible representation of a finite group of rotations and reflections, that of the
+icosahedron. Larger eigenspaces come from an infinite group."""
+
 
 @dataclass(frozen=True, eq=False)
 class Detection:
@@ -125,6 +129,13 @@ def _judged(
     elif parts["score"] > SYMMETRIC[0] or parts["commutativity"] > SYMMETRIC[1] or parts["moved"] < 0.7:
         verdict = "ambiguous"
         warnings.append(f"{name}: the symmetry found may be wrong in parts ({numbers})")
+    equal = _largest_cluster(x.basis.evals)
+    if verdict != "asymmetric" and equal > LARGEST_IRREDUCIBLE:
+        verdict = "ambiguous"
+        warnings.append(
+            f"{name}: {equal} eigenvalues are equal to 1%, and no finite symmetry explains more than "
+            f"{LARGEST_IRREDUCIBLE}: the shape has infinitely many symmetries, as a sphere has; these are some of them"
+        )
     sign = torch.zeros_like(x.basis.mass)
     if verdict == "asymmetric":
         group, products = SymmetryGroup.trivial(x.n_verts), torch.zeros(1, 1, dtype=torch.int64)
@@ -148,6 +159,16 @@ def _judged(
         len(pool),
         warnings,
     )
+
+
+def _largest_cluster(evals: Tensor, k: int = 30, rtol: float = 0.01) -> int:
+    """How many of the first eigenvalues after 0 are equal, each to its neighbour."""
+    first = evals[1:k]
+    longest, length = 1, 1
+    for same in (first.diff() < rtol * first[1:]).tolist():
+        length = length + 1 if same else 1
+        longest = max(longest, length)
+    return longest
 
 
 def _parts(x: PreparedShape, fmap: Tensor, p2p: Tensor) -> dict[str, float]:
