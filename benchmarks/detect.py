@@ -1,6 +1,7 @@
 """The symmetry groups of the built-in creatures from their spectra: group, verdict, error and seconds.
 
     python benchmarks/detect.py [--n-verts 5000] [--poses 20] [--bodies 2] [--kinds biped,quadruped,...]
+                                [--out FILE]
 
 Each creature is in a random pose and has a triangulation of its own; nothing is known of it: no reference, no mirror
 plane. Pose p is that of body p modulo --bodies. Right is a verdict of ``symmetric`` with the true group (``asymmetric``
@@ -10,6 +11,7 @@ TOSCA's shapes are in benchmarks/pairs.py.
 """
 
 import argparse
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -29,7 +31,9 @@ def one(kind: str, n_verts: int, body: int, pose: int) -> dict[str, Any]:
     found = detect_group(shape)
     seconds = perf_counter() - start
     truth = exact_maps(animal, animal).points(shape.mesh)[1:]
-    gaps = [min(float((shape.mesh.verts[m] - t).norm(dim=1).mean()) for t in truth) for m in found.group.maps[1:]]
+    gaps = []
+    for p2p in found.group.maps[1:]:
+        gaps += [min(float((shape.mesh.verts[p2p] - t).norm(dim=1).mean()) for t in truth)] if len(truth) else []
     wanted = "asymmetric" if kind == "asymmetric" else "symmetric"
     right = found.name == GROUPS[kind] and found.verdict == wanted
     numbers = {key: found.parts[key] for key in ("score", "commutativity")}
@@ -62,6 +66,7 @@ def main() -> None:
     parser.add_argument("--n-verts", type=int, default=5000)
     parser.add_argument("--poses", type=int, default=20)
     parser.add_argument("--bodies", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=RESULTS / "detect.json")
     args = parser.parse_args()
     kinds: dict[str, Any] = {}
     for kind in args.kinds.split(","):
@@ -69,7 +74,7 @@ def main() -> None:
         rows = {f"body {p % args.bodies}, pose {p}": one(kind, args.n_verts, p % args.bodies, p) for p in poses}
         kinds[kind] = summary(rows)
         print(kind, {key: value for key, value in kinds[kind].items() if key != "each"}, flush=True)
-        write_json(RESULTS / "detect.json", {"vertices": args.n_verts, "groups": GROUPS, "creatures": kinds})
+        write_json(args.out, {"vertices": args.n_verts, "groups": GROUPS, "creatures": kinds})
 
 
 if __name__ == "__main__":

@@ -225,9 +225,12 @@ def main() -> int:
     if found:
         parts.append(pairs(found))
     for name, make in (("creatures", creatures), ("detect", detect), ("speed_pair", speed)):
-        path = RESULTS / f"{name}.json"
-        if path.is_file():
-            parts.append(make(json.loads(path.read_text())))
+        found = [json.loads(path.read_text()) for path in sorted(RESULTS.glob(f"{name}*.json"))]
+        if len(found) > 1:
+            found[0]["command"] = "` and `".join(data["command"] for data in found)
+            found[0]["creatures"] = {k: v for data in found for k, v in data["creatures"].items()}
+        if found:
+            parts.append(make(found[0]))
     readme = ROOT / "README.md"
     text = readme.read_text()
     head, rest = text.split(BEGIN)
