@@ -2,6 +2,7 @@
 
 import pytest
 from references import pairs
+from references.exact import Exact
 
 
 @pytest.fixture(scope="session")
@@ -14,3 +15,21 @@ def exact():
 def either(request):
     """The exact pair, and the same with a mirrored target: the known vertex map is then the mirrored one."""
     return pairs.exact_pair(2, request.param)
+
+
+@pytest.fixture(scope="session")
+def biped():
+    """A biped at rest with its functional maps."""
+    return Exact("biped")
+
+
+@pytest.fixture(scope="session")
+def ellipsoid():
+    """A body with three mirror planes at rest with its functional maps."""
+    return Exact("ellipsoid")
+
+
+@pytest.fixture(scope="session")
+def octopus():
+    """An octopus at rest with its functional maps."""
+    return Exact("octopus")

@@ -4,80 +4,16 @@ from dataclasses import replace
 
 import pytest
 import torch
+from references.exact import K
 
 import torchqm.matching.assemble as module
-from torchqm.data.synthetic import creature
-from torchqm.fmap import nearest_isometry, p2p_to_fmap
-from torchqm.matching import MatchParameters, prepare
-from torchqm.matching.assemble import LIMIT, LIMIT_TORN, TORN, FunctionalGroup, assemble, synchronized, torn
-from torchqm.matching.proposals import Judge, Proposal, correlation
-from torchqm.matching.self_map import nearest_involution
+from torchqm.fmap import nearest_isometry
+from torchqm.matching import MatchParameters
+from torchqm.matching.assemble import LIMIT, FunctionalGroup, _whole, assemble, synchronized
+from torchqm.matching.proposals import Proposal
 from torchqm.symmetry import group_fault, group_name
 
 FULL = MatchParameters(k_max=100)
-K = 98
-"""Where no cluster of the octopus's eigenvalues is cut."""
-
-
-class Exact:
-    """A creature at rest with the functional maps of its group: ``C delta_x = delta_g(x)``."""
-
-    def __init__(self, kind, n_verts=1000):
-        self.body = creature(kind, n_verts)
-        self.shape = prepare(self.body.mesh, K)
-        self.judge = Judge(self.shape)
-        self.group = self.body.base_group
-        self.proposals = [self.proposal(g, o) for g, o in zip(self.group, self.body.orientation.tolist(), strict=True)]
-
-    def proposal(self, images, orientation, score=None):
-        fmap = p2p_to_fmap(images.argsort(), self.shape.basis, self.shape.basis)
-        undone = torch.equal(images[images], torch.arange(len(images)))
-        fmap = nearest_involution(fmap) if undone else nearest_isometry(fmap)
-        return Proposal(fmap, orientation, undone, self.judge.score(fmap, orientation) if score is None else score)
-
-    def order(self, g):
-        element, power, n = self.group[g], self.group[g], 1
-        while not torch.equal(power, self.group[0]):
-            power, n = element[power], n + 1
-        return n
-
-    def product(self, g, h):
-        """Number of ``g o h`` in the true group."""
-        wanted = self.group[g][self.group[h]]
-        return next(i for i, element in enumerate(self.group) if torch.equal(element, wanted))
-
-    def reflections(self):
-        return [g for g, o in enumerate(self.body.orientation.tolist()) if o < 0]
-
-    def numbers(self, found):
-        """Which true element each one of a group is."""
-        near = torch.tensor([[correlation(e.fmap, p.fmap) for p in self.proposals] for e in found.elements])
-        assert float(near.amax(1).min()) > 0.95
-        return near.argmax(1).tolist()
-
-    def half(self, g, axis, score=None):
-        """A reflection on one half of the body, the identity on the other: what mirrors the arms and not the legs."""
-        verts = self.shape.mesh.verts
-        side = verts[:, axis] > (verts[:, axis] * self.shape.basis.mass).sum()
-        assert torch.equal(side, side[self.group[g]])
-        images = torch.where(side, self.group[g], torch.arange(len(side)))
-        assert 0.2 < float((images != self.group[g]).double().mean()) < 0.8
-        return self.proposal(images, -1, score)
-
-
-@pytest.fixture(scope="module")
-def octopus():
-    return Exact("octopus")
-
-
-@pytest.fixture(scope="module")
-def biped():
-    return Exact("biped")
-
-
-@pytest.fixture(scope="module")
-def ellipsoid():
-    return Exact("ellipsoid")
 
 
 @pytest.fixture(scope="module")
@@ -170,26 +106,12 @@ class TestAssemble:
         assert found.products.tolist() == [[0]]
 
 
-class TestTorn:
-    def test_symmetries_tear_nothing(self, octopus, biped):
-        for exact in (octopus, biped):
-            assert {torn(exact.shape, p.fmap) for p in exact.proposals} == {0.0}
-
-    @pytest.mark.parametrize("axis", [1, 2])
-    def test_half_a_reflection_tears_along_a_line(self, biped, axis):
-        """Across the waist the tear is short, from front to back along the body it is long."""
-        length = torn(biped.shape, biped.half(1, axis).fmap)
-        assert {1: 1.0, 2: 5.0}[axis] < length < {1: 4.0, 2: 20.0}[axis]
-        assert TORN * length > LIMIT_TORN / 2
-
-    def test_a_tear_is_as_long_in_a_finer_mesh(self, biped):
-        finer = Exact("biped", 4000)
-        coarse, fine = (torn(exact.shape, exact.half(1, 1).fmap) for exact in (biped, finer))
-        assert fine == pytest.approx(coarse, rel=0.4)
-
-    def test_noise_tears_much(self, biped):
-        noise = torch.randn(K, K, generator=torch.Generator().manual_seed(0)).double()
-        assert torn(biped.shape, nearest_isometry(noise)) > 0.4 * float(biped.shape.mesh.edge_lengths.sum())
+def test_what_tears_is_not_whole(biped):
+    """A score that would do by itself, and a tear across the waist."""
+    half = biped.half(1, 1, score=LIMIT / 2)
+    both = FunctionalGroup((biped.proposals[0], half), torch.tensor([[0, 1], [1, 0]]))
+    assert not _whole(both, 1, biped.shape)
+    assert _whole(FunctionalGroup(tuple(biped.proposals), both.products), 1, biped.shape)
 
 
 def turned_by(angle, seed):

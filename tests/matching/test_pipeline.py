@@ -635,6 +635,39 @@ class TestLargeGroups:
             gaps = target.mesh.verts[found.symmetry_target[1][there]] - target.mesh.verts[there[table[1]]]
             assert float(gaps.norm(dim=1).mean()) < 0.05 * target.mesh.area**0.5
 
+    def test_a_reference_with_a_whole_group(self):
+        """Nothing but one reflection can be transferred; so the pose is asked first."""
+        rest = creature("ellipsoid", 1200)
+        posed = creature("ellipsoid", 1200, pose=2, retriangulate=1)
+        small = MatchParameters(k_max=100)
+        found = find_symmetry(posed.mesh, reference=rest.mesh, parameters=small)
+        assert (found.origin, found.details["group"]) == ("detected", "C2 x C2 x C2")
+        crab = creature("asymmetric", 1000)
+        other = find_symmetry(crab.mesh, reference=rest.mesh, parameters=small)  # has none, so one is transferred
+        assert (other.origin, len(other.labels)) == ("transfer", 2)
+
+    def test_the_spectrum_shows_more_than_the_planes_of_a_pose(self):
+        """This pose has kept two of its three planes; alone, they make four elements."""
+        posed = creature("ellipsoid", 1500, pose=2, retriangulate=1)
+        small = MatchParameters(k_max=100)
+        planes = find_symmetry(posed.mesh, parameters=small, symmetry="extrinsic")
+        found = find_symmetry(posed.mesh, parameters=small)
+        assert len(planes.labels) < len(found.labels) == 8
+
+    def test_one_unclear_map_does_not_silence_the_others(self, monkeypatch):
+        """The group says how its maps are oriented to each other."""
+        source, target = creature("ellipsoid", 800, pose=1), creature("ellipsoid", 800)
+        real, calls = prepared.orientation_agreement, []
+
+        def unclear_once(*a):
+            calls.append(a)
+            return 0.0 if len(calls) == 3 else real(*a)
+
+        monkeypatch.setattr(prepared, "orientation_agreement", unclear_once)
+        tables = {"symmetry": target.base_group, "symmetry_source": source.base_group}
+        found = match(source.mesh, target.mesh, parameters=MatchParameters(k_max=100), **tables)
+        assert found.labels == ("direct",) * 4 + ("mirrored",) * 4
+
     @staticmethod
     def covered(source, target, found, tolerance):
         """Which true maps the found ones are, each within a mean distance / sqrt(area)."""

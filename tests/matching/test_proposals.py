@@ -6,51 +6,12 @@ import pytest
 import torch
 from references.shapes import icosphere
 
-from torchqm.data.synthetic import creature
-from torchqm.fmap import p2p_to_fmap
 from torchqm.geometry import Mesh
 from torchqm.matching import MatchParameters, prepare
 from torchqm.matching.proposals import SAME, Judge, Proposal, correlation, different, grown, propose, regrown
 from torchqm.matching.self_map import nearest_involution, reflection_score
 
 FULL = MatchParameters(k_max=100)
-
-
-class Exact:
-    """A creature at rest with the functional maps of its group: ``C delta_x = delta_g(x)``."""
-
-    def __init__(self, kind, k=98):  # 98: no cluster of the octopus is cut
-        self.body = creature(kind, 1000)
-        self.shape = prepare(self.body.mesh, k)
-        basis = self.shape.basis
-        self.fmaps = [p2p_to_fmap(g.argsort(), basis, basis) for g in self.body.base_group]
-        self.orientation = self.body.orientation.tolist()
-        self.judge = Judge(self.shape)
-
-
-@pytest.fixture(scope="module")
-def ellipsoid():
-    return Exact("ellipsoid")
-
-
-@pytest.fixture(scope="module")
-def octopus():
-    return Exact("octopus")
-
-
-@pytest.fixture(scope="module")
-def biped():
-    return Exact("biped")
-
-
-def partial(exact, axis):
-    """The reflection on one half of the body, the identity on the other."""
-    verts = exact.shape.mesh.verts
-    mirror = exact.body.base_group[exact.orientation.index(-1)]
-    side = verts[:, axis] > (verts[:, axis] * exact.shape.basis.mass).sum()
-    assert torch.equal(side, side[mirror])
-    images = torch.where(side, mirror, torch.arange(len(side)))
-    return nearest_involution(p2p_to_fmap(images, exact.shape.basis, exact.shape.basis))
 
 
 def test_correlation_of_orthogonal_maps(octopus):
@@ -114,7 +75,7 @@ def test_exact_symmetries_score_nothing(kind, request):
 
 @pytest.mark.parametrize("axis", [1, 2])
 def test_what_is_no_symmetry_scores_worse(biped, axis):
-    half = partial(biped, axis)
+    half = biped.half(1, axis).fmap
     for orientation in (1, -1):
         assert biped.judge.score(half, orientation) > 0.3
     noise = torch.randn(98, 98, generator=torch.Generator().manual_seed(0)).double()

@@ -3,7 +3,7 @@ import torch
 from references.shapes import basis_of, blob, renumbered
 
 from torchqm.geometry import Mesh
-from torchqm.matching.quality import commutativity_score, orientation_agreement
+from torchqm.matching.quality import commutativity_score, orientation_agreement, torn_length
 
 
 @pytest.fixture(scope="module")
@@ -58,3 +58,37 @@ def test_it_is_weighted_by_area(shape):
 
 def test_a_constant_map_has_no_orientation(shape):
     assert orientation_agreement(shape.mesh, shape.mesh, torch.zeros(642, dtype=torch.int64)) == 0
+
+
+class TestTornLength:
+    def test_symmetries_tear_nothing(self, octopus, biped):
+        for exact in (octopus, biped):
+            assert {torn_length(exact.shape.mesh, element) for element in exact.group} == {0.0}
+
+    def test_a_strip_cut_in_two(self):
+        """A square of 20 x 20 cells; the right half is moved to where the left one is: one column of edges is torn."""
+        n = 21
+        y, x = torch.meshgrid(torch.arange(n), torch.arange(n), indexing="ij")
+        verts = torch.stack([x.flatten(), y.flatten(), torch.zeros(n * n)], 1).double() / (n - 1)
+        corner = (torch.arange(n - 1)[:, None] * n + torch.arange(n - 1)).flatten()
+        faces = torch.cat(
+            [torch.stack([corner, corner + 1, corner + n], 1), torch.stack([corner + 1, corner + n + 1, corner + n], 1)]
+        )
+        mesh = Mesh.from_arrays(verts.numpy(), faces.numpy())
+        moved = torch.arange(n * n) - torch.where(x.flatten() > 10, 10, 0)
+        # Across the cut go 21 edges of 1/20 and, on the 20 diagonals, as many of sqrt(2)/20.
+        assert torn_length(mesh, moved) == pytest.approx(21 / 20 + 2**0.5)
+        assert torn_length(mesh, torch.arange(n * n)) == 0
+
+    @pytest.mark.parametrize("axis", [1, 2])
+    def test_half_a_reflection_against_a_plain_loop(self, biped, axis):
+        mesh, mirror = biped.shape.mesh, biped.group[1]
+        side = mesh.verts[:, axis] > float(mesh.verts[:, axis].median())
+        p2p = torch.where(side, mirror, torch.arange(mesh.n_verts))
+        total = 0.0
+        for a, b in mesh.edges.tolist():
+            length = float((mesh.verts[a] - mesh.verts[b]).norm())
+            image = float((mesh.verts[p2p[a]] - mesh.verts[p2p[b]]).norm())
+            total += length if image > 3 * length + 0.02 else 0.0
+        assert torn_length(mesh, p2p) == pytest.approx(total)
+        assert total > 0.5

@@ -7,7 +7,7 @@ import torch
 from references.shapes import rotation
 from references.unchecked import unchecked
 
-from torchqm.symmetry import GroupResiduals, SymmetryGroup, common_order
+from torchqm.symmetry import GroupResiduals, SymmetryGroup
 
 
 def test_trivial_and_reflection():
@@ -156,12 +156,6 @@ def test_subset():
     for wrong in ([], [2, 0], [0, 2, 2], [0, 6], [0, -1]):
         with pytest.raises(ValueError, match="0 first, then different ones of 1 to 5"):
             group.subset(wrong)
-
-
-def test_common_order():
-    two, four = SymmetryGroup.from_reflection(torch.tensor([1, 0])), SymmetryGroup.trivial(2)
-    assert common_order(two, two) == 2
-    assert common_order(two, four) == 1
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,11 @@ from torchqm.fmap.convert import fmap_to_p2p
 from torchqm.fmap.refine import nearest_isometry
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.proposals import CHOICE, Judge, Proposal, correlation, grown, regrown
+from torchqm.matching.quality import torn_length
 from torchqm.matching.shape import PreparedShape
 from torchqm.symmetry.algebra import group_fault
 
-__all__ = ["FunctionalGroup", "assemble", "synchronized", "torn"]
+__all__ = ["FunctionalGroup", "assemble", "synchronized"]
 
 ALIKE = 0.6
 """Correlation above which a product is taken for an element; those of different elements are 0.4 at most."""
@@ -57,8 +58,8 @@ def assemble(pool: Sequence[Proposal], judge: Judge, parameters: MatchParameters
     not, or the two are a group indeed.
 
     A map is good if its score is at most :data:`LIMIT` and 3.5 times the best one (or 0.03); and the new elements
-    together, made consistent with each other, must not exceed :data:`LIMIT_TORN` on average when :func:`torn` edges are
-    added.
+    together, made consistent with each other, must not exceed :data:`LIMIT_TORN` on average when torn edges
+    (:func:`torchqm.matching.quality.torn_length`) are added.
 
     Args:
         pool: different self-maps, the best first.
@@ -85,7 +86,11 @@ def assemble(pool: Sequence[Proposal], judge: Judge, parameters: MatchParameters
 
 def _whole(group: FunctionalGroup, old: int, x: PreparedShape) -> bool:
     """Whether the elements from number ``old`` on are whole, taken together."""
-    totals = [e.score + TORN * torn(x, e.fmap) for e in group.elements[old:]]
+    totals = []
+    for element in group.elements[old:]:
+        basis = x.basis.truncate(element.fmap.shape[0])
+        p2p = fmap_to_p2p(element.fmap, basis, basis, search=x.search, guide=x.search)
+        totals.append(element.score + TORN * torn_length(x.mesh, p2p))
     return sum(totals) <= LIMIT_TORN * len(totals)
 
 
@@ -114,24 +119,6 @@ def _closed(
     found = synchronized(FunctionalGroup(tuple(group), products))
     scored = [replace(e, score=judge.score(e.fmap, e.orientation)) for e in found.elements[1:]]
     return replace(found, elements=(found.elements[0], *scored))
-
-
-def torn(x: PreparedShape, fmap: Float[Tensor, "K K"]) -> float:
-    """Length of the edges that a self-map tears / sqrt(area): images over three times as long, plus 0.02 sqrt(area).
-
-    The same tear has the same length in a coarse and in a fine mesh.
-
-    Args:
-        x: the shape.
-        fmap: in its first K functions.
-    """
-    basis = x.basis.truncate(fmap.shape[0])
-    p2p = fmap_to_p2p(fmap, basis, basis, search=x.search, guide=x.search)
-    a, b = x.mesh.edges.T
-    verts = x.mesh.verts
-    images = (verts[p2p[a]] - verts[p2p[b]]).norm(dim=1)
-    lengths = x.mesh.edge_lengths
-    return float(lengths[images > 3 * lengths + 0.02].sum())
 
 
 def _refined(fmap: Tensor, orientation: int, judge: Judge, parameters: MatchParameters) -> Proposal:

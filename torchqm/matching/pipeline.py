@@ -47,10 +47,11 @@ def match(
 ) -> MatchResult:
     """All the equally good dense maps from one shape to another.
 
-    First the symmetry of both must be known. With ``symmetry='auto'`` a mirror plane is looked for in the reference if
-    there is one, else in both shapes; a shape without plane gets its symmetry by transfer from one that has it
-    (sections 5 and 6.1), and if none has, each is asked its own spectrum
-    (:func:`torchqm.matching.detect.detect_group`). Then the two are matched in the quotient (section 4).
+    First the symmetry of both must be known. With ``symmetry='auto'`` mirror planes are looked for in the reference if
+    there is one, else in both shapes; a shape without plane gets its reflection by transfer from one that has it
+    (sections 5 and 6.1). If none has, or a shape may have more than its planes show, it is asked its own spectrum
+    (:func:`torchqm.matching.detect.detect_group`). Then the two are matched in the quotient (section 4) by the largest
+    group that both have.
 
     Args:
         source: a mesh or its file.
@@ -200,28 +201,50 @@ class Collection:
 
         Args:
             shape: the shape.
-            how: without a reference: ``extrinsic`` (its mirror plane), ``detect`` (its spectrum), or ``auto``: the
-                plane if it fits firmly, else what its spectrum says, else the plane that fits roughly.
+            how: without a reference: ``extrinsic`` (its mirror planes), ``detect`` (its spectrum), or ``auto``: the
+                planes if they fit firmly (and the spectrum if it shows more), else what the spectrum says, else the
+                plane that fits roughly.
         """
-        key = (id(shape), how)
+        key = (id(shape), f"{how} or reference")
         if key not in self._symmetries:
-            cost = shape.n_verts / 1000
             if self._reference is not None and self.shape(self._reference) is not shape:
                 reference = self.shape(self._reference)
                 known = self.transfer(shape, reference, self.symmetry(reference, how))
-            elif how == "detect":
+            elif how == "auto":
+                known = self._own(shape, "extrinsic")
+                if known.firm:
+                    known = self._larger(shape, known)
+                else:
+                    detected = self._own(shape, "detect")
+                    known = detected if detected.firm or not known.known else known
+            else:
+                known = self._own(shape, how)
+            self._symmetries[key] = (shape, known)  # kept like the meshes above
+        return self._symmetries[key][1]
+
+    def _own(self, shape: PreparedShape, how: str) -> KnownSymmetry:
+        """The symmetry that a shape itself shows, by its mirror planes or its spectrum; a reference is not asked."""
+        key = (id(shape), how)
+        if key not in self._symmetries:
+            cost = shape.n_verts / 1000
+            if how == "detect":
                 with self.steps(f"symmetry of {shape.mesh.name} from its spectrum", COST["detect"] * cost):
                     known = detected_symmetry(shape, self.parameters)
-            elif how == "auto":
-                known = self.symmetry(shape)
-                if not known.firm:
-                    detected = self.symmetry(shape, "detect")
-                    known = detected if detected.firm or not known.known else known
             else:
                 with self.steps(f"mirror plane of {shape.mesh.name}", COST["plane"] * cost):
                     known = extrinsic_symmetry(shape)
-            self._symmetries[key] = (shape, known)  # kept like the meshes above
+            self._symmetries[key] = (shape, known)
         return self._symmetries[key][1]
+
+    def _larger(self, shape: PreparedShape, known: KnownSymmetry) -> KnownSymmetry:
+        """The group that the spectrum shows, if it is larger: a pose may have kept a few of many mirror planes.
+
+        One plane is what most shapes have, and more than three a posed shape hardly keeps: neither is doubted.
+        """
+        if known.origin != "extrinsic" or not 2 <= known.details.get("planes", 1) <= 3:
+            return known
+        found = self._own(shape, "detect")
+        return found if found.group.order > known.group.order else known
 
     def transfer(self, shape: PreparedShape, reference: PreparedShape, known: KnownSymmetry) -> KnownSymmetry:
         """A shape's symmetry by transfer from another; trivial if that has none."""
@@ -229,7 +252,7 @@ class Collection:
             return no_symmetry(shape, list(known.warnings))
         if not known.reflection:
             # What is transferred is one reflection; a larger group is looked for in the shape itself first.
-            found = self.symmetry(shape, "detect")
+            found = self._own(shape, "detect")
             if found.known:
                 return found
             single = first_reflection(reference, known)
@@ -290,16 +313,16 @@ class Collection:
             known_x = self.transfer(x, y, known_y)
         elif _gives_way(known_y, known_x):
             known_y = self.transfer(y, x, known_x)
-        if how == "auto" and self.method == "quotient" and max(known_x.group.order, known_y.group.order) > 2:
-            known_x, known_y = self._larger(x, known_x), self._larger(y, known_y)
+        if how == "auto" and self.method == "quotient":
+            known_x, known_y = self._at_least(x, known_x, known_y), self._at_least(y, known_y, known_x)
         return known_x, known_y
 
-    def _larger(self, shape: PreparedShape, known: KnownSymmetry) -> KnownSymmetry:
-        """The group that the spectrum shows, if it is larger: an octopus in a pose may have kept one or two planes."""
-        if known.origin not in ("extrinsic", "transfer") or known.details.get("planes", 1) > 3:
-            return known
-        found = self.symmetry(shape, "detect")
-        return found if found.group.order > known.group.order else known
+    def _at_least(self, shape: PreparedShape, mine: KnownSymmetry, other: KnownSymmetry) -> KnownSymmetry:
+        """The group that the spectrum shows, if the other shape has a larger one than is known here, and it helps."""
+        if mine.origin == "extrinsic" and mine.group.order < other.group.order:
+            found = self._own(shape, "detect")
+            return found if found.group.order > mine.group.order else mine
+        return self._larger(shape, mine)
 
     def expected_work(self, *meshes: Mesh | PreparedShape, symmetries: bool = True, match: bool = True) -> float:
         """Expected work, in the unit of ``COST``; what was done for an earlier pair costs nothing.

@@ -49,23 +49,8 @@ def match_prepared(
     steps = steps or Steps()
     earlier = dict(steps.seconds)
     warnings = list(dict.fromkeys([*x.warnings, *y.warnings, *known_x.warnings, *known_y.warnings]))
-    before = known_x.group.order, known_y.group.order
-    names = known_x.name, known_y.name
-    if before[0] == 1 or before[1] == 1:
-        known_x, known_y = (known if max(before) == 1 else no_symmetry(s) for s, known in ((x, known_x), (y, known_y)))
-    elif method == "quotient":
-        known_x, known_y = common_symmetry(x, y, known_x, known_y)
-    else:
-        known_x, known_y = one_reflection(x, y, known_x, known_y)
-    after = known_x.group.order
-    if before[0] != before[1]:
-        used = "the identity alone" if after == 1 else f"the {after} elements that both have ({known_x.name})"
-        warnings.append(f"the groups differ ({before[0]} and {before[1]} elements): matched with {used}")
-    elif after != before[0]:
-        warnings.append(
-            f"of the symmetries ({names[0]} and {names[1]}, {before[0]} elements) {after} elements are used"
-            + ("" if method == "quotient" else f": method {method!r} is made for one reflection")
-        )
+    known_x, known_y, remark = _in_common(x, y, known_x, known_y, method)
+    warnings += [remark] if remark else []
     k = basis_size([x.basis, y.basis], parameters.k)
     if k < parameters.k:
         warnings.append(f"k is {k} instead of {parameters.k}: the next eigenvalues equal the one before them")
@@ -120,21 +105,28 @@ def match_prepared(
         agreement = [orientation_agreement(x.mesh, y.mesh, m) for m in maps]
         basis_y = y.basis.truncate(fmap.shape[0])
         fmaps = torch.stack([p2p_to_fmap(m, basis_y, basis_y) @ fmap for m in known_y.group.maps])
-        labels = ["unknown"] * len(maps)
+        label = "unknown"
         if oriented:
             omega_x, omega_y = (orientation_tensor(shape.mesh, shape.basis) for shape in (x, y))
-            smooth = [orientation_cosine(c, omega_x, omega_y) for c in fmaps]
-            details |= {"orientation_cosines": smooth}
-            labels = [map_label(a, c) for a, c in zip(agreement, smooth, strict=True)]
+            cosines = [orientation_cosine(c, omega_x, omega_y) for c in fmaps]
+            details |= {"orientation_cosines": cosines}
+            # The elements of the group say how the maps are oriented to each other; so one label gives them all.
+            turned = known_y.orientation
+            label = map_label(
+                float((turned @ torch.tensor(agreement, dtype=turned.dtype)) / len(maps)),
+                float((turned @ torch.tensor(cosines, dtype=turned.dtype)) / len(maps)),
+            )
         if not oriented:
             warnings.append("a mesh is not consistently orientable: direct and mirrored cannot be told apart")
-        elif separated is False or "unknown" in labels:
-            labels = ["unknown"] * len(labels)
+        elif separated is False or label == "unknown":
+            label = "unknown"
             numbers = {n: round(v, 2) for n, v in details.items() if n.startswith("residual")}
             warnings.append(
                 f"direct and mirrored are not told apart: orientation agreement {[round(a, 2) for a in agreement]}"
                 + (f", residuals {numbers}" if numbers else "")
             )
+        other = {"direct": "mirrored", "mirrored": "direct", "unknown": "unknown"}[label]
+        labels = [label if orientation > 0 else other for orientation in known_y.orientation.tolist()]
         scores = torch.tensor([commutativity_score(m, x.basis, y.basis) for m in maps], dtype=torch.float64)
         if float(scores.min()) > POOR_SCORE:
             warnings.append(
@@ -159,6 +151,29 @@ def match_prepared(
         seconds=steps.since(earlier),
         details=details,
     )
+
+
+def _in_common(
+    x: PreparedShape, y: PreparedShape, known_x: KnownSymmetry, known_y: KnownSymmetry, method: str
+) -> tuple[KnownSymmetry, KnownSymmetry, str | None]:
+    """The symmetries that a method can use of two shapes, and what to say of it if these are not all."""
+    order_x, order_y = known_x.group.order, known_y.group.order
+    names = f"{known_x.name} and {known_y.name}"
+    if min(order_x, order_y) == 1:
+        if order_x != order_y:
+            known_x, known_y = no_symmetry(x), no_symmetry(y)
+    elif method == "quotient":
+        known_x, known_y = common_symmetry(x, y, known_x, known_y)
+    else:
+        known_x, known_y = one_reflection(x, y, known_x, known_y)
+    order = known_x.group.order
+    if order_x != order_y:
+        used = "the identity alone" if order == 1 else f"the {order} elements that both have ({known_x.name})"
+        return known_x, known_y, f"the groups differ ({order_x} and {order_y} elements): matched with {used}"
+    if order != order_x:
+        why = "" if method == "quotient" else f": method {method!r} is made for one reflection"
+        return known_x, known_y, f"of the symmetries ({names}, {order_x} elements) {order} elements are used{why}"
+    return known_x, known_y, None
 
 
 def _spectrum_warning(shape: PreparedShape, k: int, rtol: float = 1e-3, most: float = 0.2) -> str | None:

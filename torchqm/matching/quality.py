@@ -8,7 +8,7 @@ from torchqm.fmap.convert import p2p_to_fmap
 from torchqm.geometry.mesh import Mesh
 from torchqm.spectral.basis import SpectralBasis
 
-__all__ = ["commutativity_score", "commutator_norm", "orientation_agreement"]
+__all__ = ["commutativity_score", "commutator_norm", "orientation_agreement", "torn_length"]
 
 
 def commutativity_score(
@@ -50,3 +50,18 @@ def orientation_agreement(mesh_x: Mesh, mesh_y: Mesh, p2p_xy: Int[Tensor, " Vx"]
     sign = torch.sign((image * normals[corners[:, 0]]).sum(1))
     weight = mesh_x.face_areas * (sign != 0)
     return float((sign * weight).sum() / weight.sum().clamp_min(1e-300))
+
+
+def torn_length(mesh: Mesh, p2p: Int[Tensor, " V"]) -> float:
+    """Length of the edges that a point map tears: their images are over three times as long, plus 0.02 sqrt(area).
+
+    The same tear has the same length in a coarse and in a fine mesh.
+
+    Args:
+        mesh: the shape that is mapped, of area 1.
+        p2p: for each of its vertices a vertex of the same shape.
+    """
+    verts = mesh.verts
+    a, b = mesh.edges.T
+    images = (verts[p2p[a]] - verts[p2p[b]]).norm(dim=1)
+    return float(mesh.edge_lengths[images > 3 * mesh.edge_lengths + 0.02].sum())

@@ -92,7 +92,7 @@ class SymmetryResult:
         maps: ``(|G|, V)`` int64 vertex maps, row 0 the identity.
         labels: ``direct`` or ``mirrored`` or ``unknown``, one a row.
         scores: ``(|G|,)`` commutativity defect of each map; 0 for the identity.
-        origin: where it came from: ``extrinsic``, ``file`` or ``transfer``.
+        origin: where it came from: ``extrinsic``, ``detected``, ``transfer`` or ``none``.
         warnings: as in :class:`MatchResult`, and so the remaining ones.
     """
 

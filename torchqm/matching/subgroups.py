@@ -14,8 +14,6 @@ __all__ = ["common_symmetry", "first_reflection", "one_reflection", "subgroups"]
 N_COMPARED = 60
 """Functions whose symmetric part is compared to tell subgroups of a shape apart."""
 
-MOST_PAIRS = 400
-
 Elements = tuple[int, ...]
 
 
@@ -119,8 +117,6 @@ def _best_pair(
     of_x: list[Elements],
     of_y: list[Elements],
 ) -> tuple[KnownSymmetry, KnownSymmetry]:
-    n = max(1, MOST_PAIRS // max(len(of_x), len(of_y)))
-    of_x, of_y = of_x[:n] if len(of_x) > n else of_x, of_y[:n] if len(of_y) > n else of_y
     spectra_x = [_even_evals(x, known_x, elements) for elements in of_x]
     spectra_y = [_even_evals(y, known_y, elements) for elements in of_y]
     gaps = torch.tensor([[_gap(a, b) for b in spectra_y] for a in spectra_x])

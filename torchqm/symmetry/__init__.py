@@ -19,7 +19,7 @@ from torchqm.symmetry.extrinsic import (
     find_reflection,
     find_reflections,
 )
-from torchqm.symmetry.group import GroupResiduals, SymmetryGroup, common_order
+from torchqm.symmetry.group import GroupResiduals, SymmetryGroup
 from torchqm.symmetry.irreducible import IsotypicComponent, isotypic_components
 from torchqm.symmetry.leftright import LeftRight, displacement, halves_of_reflection, persistence_clusters
 from torchqm.symmetry.orientation import (
@@ -41,7 +41,6 @@ __all__ = [
     "SymmetrizedBasis",
     "SymmetryGroup",
     "central_idempotents",
-    "common_order",
     "conjugacy_classes",
     "displacement",
     "element_orders",

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchqm.symmetry.algebra import group_fault, group_name
 
-__all__ = ["GroupResiduals", "SymmetryGroup", "common_order"]
+__all__ = ["GroupResiduals", "SymmetryGroup"]
 
 N_COMPARED = 500
 """Maps are compared at this many vertices at most: enough for means to a few percent, and quick for 48 maps."""
@@ -225,11 +225,6 @@ class SymmetryGroup:
             closure = max(closure, float(nearest.max()))
             inverse = max(inverse, float((share @ _gaps(moved, images[:, :1])[:, :, 0]).min()))
         return GroupResiduals(closure, inverse, products)
-
-
-def common_order(a: SymmetryGroup, b: SymmetryGroup) -> int:
-    """The order both groups have, or 1 (the trivial group) where they differ: no isometry relates their symmetries."""
-    return a.order if a.order == b.order else 1
 
 
 def _gaps(a: Tensor, b: Tensor) -> Tensor:

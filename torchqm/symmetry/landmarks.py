@@ -120,10 +120,12 @@ def peaks(mesh: Mesh, height: Float[Tensor, " V"]) -> tuple[Int[Tensor, " P"], F
             high, low = (one, other) if rank[one] > rank[other] else (other, one)
             leader[low] = high
             lived[low] = float(h[low] - h[by_rank[place]])
+    lowest = np.full(len(h), np.inf)
+    np.minimum.at(lowest, top[used], h[used])
     bottom: dict[int, float] = {}
-    for vertex, t in zip(used.tolist(), top[used].tolist(), strict=True):
+    for t in tops.tolist():
         root = find(t)
-        bottom[root] = min(bottom.get(root, np.inf), float(h[vertex]))
+        bottom[root] = min(bottom.get(root, np.inf), float(lowest[t]))
     lived |= {root: float(h[root]) - low for root, low in bottom.items()}
     ids = np.array(sorted(lived, key=lambda t: (-lived[t], t)), dtype=np.int64)
     return torch.from_numpy(ids), torch.tensor([lived[int(t)] for t in ids], dtype=height.dtype)
