@@ -77,19 +77,34 @@ class Truth:
         return torch.cat([self.truth.flatten(), self.landmark_truth.flatten()]).unique()
 
 
+class PlainTruth:
+    """Points of a class and nothing else: for gorillas, which have no undeformed pose and so no known reflection.
+
+    Or, of any class, without the landmarks: their true distances take as long as those of the points.
+    """
+
+    def __init__(self, benchmark: SCBenchmark, cls: str, reflected: Truth | None = None) -> None:
+        first = load_mesh(benchmark.mesh_path(benchmark.shapes(cls)[0]))
+        self.points = spread_points(first, N_POINTS) if reflected is None else reflected.points
+        self.truth = self.points[None] if reflected is None else reflected.truth
+        self.sources = self.truth.flatten().unique()
+
+
 class Shapes:
     """Prepared shapes and distances of a class, each computed once (and kept in the cache folder)."""
 
-    def __init__(self, benchmark: SCBenchmark, truth: Truth, cache: Path | None) -> None:
-        self.benchmark, self.truth, self.cache = benchmark, truth, cache
+    def __init__(
+        self, benchmark: SCBenchmark, truth: "Truth | PlainTruth", cache: Path | None, k: int = PAPER.k_max
+    ) -> None:
+        self.benchmark, self.truth, self.cache, self.k = benchmark, truth, cache, k
         self._shapes: dict[str, PreparedShape] = {}
         self._distances: dict[str, TruthDistances] = {}
 
     def shape(self, name: str) -> PreparedShape:
         if name not in self._shapes:
             mesh = load_mesh(self.benchmark.mesh_path(name))
-            basis = cached_basis(mesh.normalized(), PAPER.k_max, self.cache)
-            self._shapes[name] = prepare(mesh, PAPER.k_max, basis=basis)
+            basis = cached_basis(mesh.normalized(), self.k, self.cache)
+            self._shapes[name] = prepare(mesh, self.k, basis=basis)
         return self._shapes[name]
 
     def distances(self, name: str) -> TruthDistances:
@@ -100,7 +115,10 @@ class Shapes:
 
     def errors(self, p2p: Tensor, target: str, landmarks: bool = False) -> Tensor:
         """(2, S) errors of a point map against the plain and the mirrored truth."""
-        truth = self.truth.landmark_truth if landmarks else self.truth.truth
+        truth = self.truth.truth
+        if landmarks:
+            assert isinstance(self.truth, Truth)
+            truth = self.truth.landmark_truth
         return self.distances(target).errors(p2p[truth[0]], truth)
 
 
