@@ -19,7 +19,7 @@ from torchqm.matching.known import (
     transferred_symmetry,
 )
 from torchqm.matching.parameters import MatchParameters
-from torchqm.matching.prepared import COST, match_prepared, orientation_label
+from torchqm.matching.prepared import COST, DETECTION, match_prepared, orientation_label
 from torchqm.matching.quality import commutativity_score, orientation_agreement
 from torchqm.matching.result import MatchResult, SymmetryResult
 from torchqm.matching.shape import N_ANCHORS, PreparedShape, prepare
@@ -228,7 +228,10 @@ class Collection:
         if key not in self._symmetries:
             cost = shape.n_verts / 1000
             if how == "detect":
-                with self.steps(f"symmetry of {shape.mesh.name} from its spectrum", COST["detect"] * cost):
+                # Only now is it known that this is needed; what is left grows by it.
+                work = DETECTION + COST["detect"] * cost
+                self.steps.total += work
+                with self.steps(f"symmetry of {shape.mesh.name} from its spectrum", work):
                     known = detected_symmetry(shape, self.parameters)
             else:
                 with self.steps(f"mirror plane of {shape.mesh.name}", COST["plane"] * cost):

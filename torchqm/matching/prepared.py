@@ -26,13 +26,16 @@ from torchqm.matching.steps import Steps
 from torchqm.matching.subgroups import common_symmetry, one_reflection
 from torchqm.symmetry.orientation import orientation_cosine, orientation_tensor
 
-__all__ = ["COST", "POOR_SCORE", "map_label", "match_prepared", "orientation_label"]
+__all__ = ["COST", "DETECTION", "POOR_SCORE", "map_label", "match_prepared", "orientation_label"]
 
 POOR_SCORE = 0.15
 """Commutativity score above which a map is called poor; true maps of TOSCA have 0.03 (wolf) to 0.13 (cat)."""
 
-COST = {"eigenpairs": 0.3, "plane": 0.025, "detect": 0.4, "transfer": 0.16, "quotient": 0.045, "maps": 0.07}
+COST = {"eigenpairs": 0.3, "plane": 0.025, "detect": 0.1, "transfer": 0.16, "quotient": 0.045, "maps": 0.07}
 """Expected seconds per step and 1000 vertices, for the share of work done; only their ratios matter."""
+
+DETECTION = 2.5
+"""Expected seconds of a detection that do not depend on the number of vertices."""
 
 
 def match_prepared(
