@@ -459,9 +459,9 @@ class TestCollection:
         for name in ("prepare", "extrinsic_symmetry", "transferred_symmetry"):
             inner = getattr(module, name)
 
-            def counted(first, *rest, inner=inner, name=name):
+            def counted(first, *rest, inner=inner, name=name, **options):
                 done[name, getattr(first, "mesh", first).name] += 1
-                return inner(first, *rest)
+                return inner(first, *rest, **options)
 
             monkeypatch.setattr(module, name, counted)
         source, target, rest = (c.mesh for c in pair)

@@ -11,7 +11,6 @@ from torchqm.matching import (
     match_quotient,
     prepare,
     refine_by_icp,
-    refine_by_odd_block,
 )
 from torchqm.matching.quotient import dense_map, refine_fmap
 from torchqm.symmetry import SymmetryGroup
@@ -105,16 +104,6 @@ def test_icp_mends_a_damaged_map(exact):
     torch.testing.assert_close(found, truth(exact), atol=1e-6, rtol=0)
     assert torch.equal(dense_map(found, exact.x, exact.y), exact.p2p_xy)
     assert refine_by_icp(damaged, exact.x, exact.y, FAST.changed(k_max=40)).shape == (40, 40)
-
-
-def test_odd_block_and_upsampling_give_the_direct_map(either):
-    found = match_quotient(either.x, either.y, either.group_x, either.group_y, FAST)
-    fmap, odd = refine_by_odd_block(found, either.x, either.y, FAST)
-    assert fmap.shape == (K, K)
-    assert odd.separated
-    same = torch.allclose(either.x.mesh.verts, either.y.mesh.verts[either.p2p_xy])
-    direct = either.p2p_xy if same else either.group_y.maps[1][either.p2p_xy]
-    assert torch.equal(dense_map(fmap, either.x, either.y), direct)
 
 
 def test_upsampling_ends_at_k_max(exact):

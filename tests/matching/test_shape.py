@@ -67,6 +67,32 @@ def test_given_eigenpairs_are_used(mesh):
         prepare(mesh, 31, basis=basis)
 
 
+def test_eigenpairs_from_the_cache_are_those_that_are_computed(mesh, shape, tmp_path, monkeypatch):
+    first = prepare(mesh, 20, cache_dir=tmp_path)
+    monkeypatch.setattr("torchqm.spectral.cache.eigenbasis", None)  # from here on nothing can be computed
+    again, fewer = prepare(mesh, 20, cache_dir=tmp_path), prepare(mesh, 9, cache_dir=tmp_path)
+    monkeypatch.setenv("TORCHQM_CACHE", str(tmp_path))
+    for found in (first, again, prepare(mesh, 20)):
+        torch.testing.assert_close(found.basis.evals, shape.basis.evals)
+        torch.testing.assert_close(found.basis.mass, shape.basis.mass)
+        assert basis_allclose(found.basis.evecs, shape.basis.evecs, shape.basis.evals, shape.basis.mass)
+        assert found.operator.startswith(f"{shape.operator}; eigenpairs: torchqm ")
+        assert found.warnings == []
+    assert torch.equal(first.basis.evecs, again.basis.evecs)
+    assert again.operator.endswith(", from the cache")
+    assert fewer.basis.k == 9
+
+
+def test_a_damaged_cache_is_a_warning_of_the_shape(mesh, tmp_path, recwarn):
+    prepare(mesh, 5, cache_dir=tmp_path)
+    (path,) = tmp_path.glob("*.npz")
+    path.write_bytes(b"")
+    (text,) = prepare(mesh, 5, cache_dir=tmp_path).warnings
+    assert text.startswith(f"{path}: damaged or foreign cache entry")
+    assert prepare(mesh, 5, cache_dir=tmp_path).warnings == []
+    assert len(recwarn) == 0  # told once
+
+
 def test_more_eigenpairs_than_vertices(mesh):
     with pytest.raises(SpectrumError, match=r"blob2: 643 eigenpairs.*642"):
         prepare(mesh, 643)

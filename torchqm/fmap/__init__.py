@@ -19,8 +19,10 @@ from torchqm.fmap.refine import (
     upsample,
 )
 from torchqm.fmap.solve import solve_fmap
+from torchqm.fmap.two_way import Places, growing_pairs, two_way_upsample
 
 __all__ = [
+    "Places",
     "SurfaceSearch",
     "commutativity_energy",
     "commutativity_weights",
@@ -29,6 +31,7 @@ __all__ = [
     "descriptor_energy",
     "fmap_to_p2p",
     "frequency_mask",
+    "growing_pairs",
     "growing_sizes",
     "nearest_isometry",
     "nearest_rows",
@@ -39,5 +42,6 @@ __all__ = [
     "semi_quotient_icp",
     "semi_upsample",
     "solve_fmap",
+    "two_way_upsample",
     "upsample",
 ]

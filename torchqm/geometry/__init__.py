@@ -9,7 +9,10 @@ from torchqm.geometry.check import (
     orient_faces,
     weld,
 )
+from torchqm.geometry.curvature import mean_curvature, vertex_normals
+from torchqm.geometry.diffusion import diffused
 from torchqm.geometry.geodesic import EdgePoints, distance_to_curve, distances, edge_graph, nodal_crossings
+from torchqm.geometry.gradient import VertexGradient, tangent_frames, vertex_gradient
 from torchqm.geometry.io import load_mesh, save_mesh
 from torchqm.geometry.laplacian import (
     Laplacian,
@@ -28,10 +31,12 @@ __all__ = [
     "Mesh",
     "MeshError",
     "MeshReport",
+    "VertexGradient",
     "area_samples",
     "check_mesh",
     "clean_faces",
     "cotan_stiffness",
+    "diffused",
     "distance_to_curve",
     "distances",
     "edge_graph",
@@ -40,10 +45,14 @@ __all__ = [
     "laplacian",
     "load_mesh",
     "lumped_mass",
+    "mean_curvature",
     "nodal_crossings",
     "orient_faces",
     "robust_stiffness",
     "save_mesh",
+    "tangent_frames",
     "to_scipy",
+    "vertex_gradient",
+    "vertex_normals",
     "weld",
 ]

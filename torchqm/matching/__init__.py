@@ -1,5 +1,6 @@
 """Floor 5: the matchers: quotient, semi-quotient, symmetry transfer, and the pipeline that joins them."""
 
+from torchqm.matching.candidates import FullMap, full_map_from_blocks
 from torchqm.matching.detect import Detection, detect_group
 from torchqm.matching.known import KnownSymmetry, extrinsic_symmetry, given_symmetry, no_symmetry, transferred_symmetry
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
@@ -13,7 +14,7 @@ from torchqm.matching.pipeline import (
     match,
 )
 from torchqm.matching.prepared import match_prepared
-from torchqm.matching.quotient import QuotientMatch, choose_halves, match_quotient, refine_by_icp, refine_by_odd_block
+from torchqm.matching.quotient import QuotientMatch, choose_halves, match_quotient, refine_by_icp
 from torchqm.matching.result import MatchResult, SymmetryResult
 from torchqm.matching.self_map import nearest_involution
 from torchqm.matching.semi_quotient import SemiQuotientMatch, match_semi_quotient, pull_back
@@ -25,6 +26,7 @@ __all__ = [
     "SYMMETRIES",
     "Collection",
     "Detection",
+    "FullMap",
     "KnownSymmetry",
     "MatchError",
     "MatchParameters",
@@ -40,6 +42,7 @@ __all__ = [
     "detect_symmetry",
     "extrinsic_symmetry",
     "find_symmetry",
+    "full_map_from_blocks",
     "given_symmetry",
     "join_blocks",
     "match",
@@ -51,7 +54,6 @@ __all__ = [
     "prepare",
     "pull_back",
     "refine_by_icp",
-    "refine_by_odd_block",
     "solve_odd",
     "transfer_symmetry",
     "transferred_symmetry",

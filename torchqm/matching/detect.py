@@ -15,7 +15,7 @@ from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.parity import odd_halves
 from torchqm.matching.proposals import Judge, Proposal, correlation, propose
 from torchqm.matching.quality import commutativity_score, orientation_agreement
-from torchqm.matching.self_map import grow_self_map
+from torchqm.matching.self_map import grow_self_map, settled_self_map
 from torchqm.matching.shape import N_ANCHORS, PreparedShape
 from torchqm.symmetry.algebra import group_name
 from torchqm.symmetry.group import SymmetryGroup
@@ -110,9 +110,8 @@ def _judged(
     for element in elements:
         with one_thread():
             fmap = grow_self_map(element.fmap, x, few, parameters.k_max, n_anchors, element.involution)
-        basis = x.basis.truncate(fmap.shape[0])
         fmaps.append(fmap)
-        maps.append(fmap_to_p2p(fmap, basis, basis, search=x.search, guide=x.search))
+        maps.append(_point_map(fmap, x))
     parts = _parts(x, fmaps[0], maps[0])
     parts["score"] = elements[0].score
     rest = [p.score for p in pool if all(correlation(p.fmap, e.fmap) <= ALIKE for e in elements)]
@@ -143,6 +142,10 @@ def _judged(
     if verdict == "asymmetric":
         group, products = SymmetryGroup.trivial(x.n_verts), torch.zeros(1, 1, dtype=torch.int64)
     else:
+        # The numbers above are those of maps that know nothing of local features, which would flatter them.
+        with one_thread():
+            fmaps = [settled_self_map(f, x, few, e.involution) for f, e in zip(fmaps, elements, strict=True)]
+        maps = [_point_map(fmap, x) for fmap in fmaps]
         group = SymmetryGroup(torch.stack([torch.arange(x.n_verts), *maps]))
         products = found.products
         if group.order == 2 and elements[0].orientation < 0:
@@ -162,6 +165,11 @@ def _judged(
         len(pool),
         warnings,
     )
+
+
+def _point_map(fmap: Tensor, x: PreparedShape) -> Tensor:
+    basis = x.basis.truncate(fmap.shape[0])
+    return fmap_to_p2p(fmap, basis, basis, search=x.search, guide=x.search)
 
 
 def _largest_cluster(evals: Tensor, k: int = 30, rtol: float = 0.01) -> int:

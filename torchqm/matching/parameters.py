@@ -16,6 +16,8 @@ class MatchParameters:
 
     Args:
         k: eigenfunctions in which the first map is computed (the paper: 30).
+        k_quotient: eigenfunctions up to which a second candidate is grown between symmetric functions alone, before
+            left and right are told apart; no more than ``k`` leaves it out (the paper).
         k_max: eigenfunctions that the final refinement reaches (the paper: 300).
         descriptor: ``wks`` or ``hks``.
         n_descriptors: energies of the WKS, or times of the HKS (the paper: 100).
@@ -30,12 +32,15 @@ class MatchParameters:
         time: diffusion time of the deltas (1 = the area of the shape).
         n_samples: vertices, drawn by area, that stand for the surface.
         semi_width: width of the frequency mask in semi-quotient ICP; None is the iteration as printed.
-        refinement: ``icp`` (the paper: ICP at k = 100 and 300), ``upsample`` (growing basis) or ``none``.
+        refinement: ``icp`` (the paper: ICP at k = 100 and 300), ``upsample`` (growing basis, both ways) or ``none``.
+        local_weight: of local features against spectral coordinates in two-way upsampling
+            (:func:`torchqm.fmap.two_way.two_way_upsample`).
         growth: ratio by which the basis grows from one step of upsampling to the next.
         seed: of the samples.
     """
 
     k: int = 30
+    k_quotient: int = 60
     k_max: int = 200
     descriptor: str = "wks"
     n_descriptors: int = 100
@@ -48,6 +53,7 @@ class MatchParameters:
     n_samples: int = 2000
     semi_width: float | None = 0.2
     refinement: str = "upsample"
+    local_weight: float = 2.0
     growth: float = 1.2
     seed: int = 0
 
@@ -62,7 +68,7 @@ class MatchParameters:
         for name in ("n_descriptors", "n_samples"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: must be at least 1")
-        for name in ("splits", "icp_steps", "icp_tolerance", "commutativity", "time"):
+        for name in ("splits", "icp_steps", "icp_tolerance", "commutativity", "time", "local_weight", "k_quotient"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}={getattr(self, name)}: must not be negative")
         if not self.self_commutativity or min(self.self_commutativity) < 0:
@@ -81,7 +87,7 @@ class MatchParameters:
     @classmethod
     def paper(cls) -> "MatchParameters":
         """Section 7.4: k = 30, WKS with 100 energies, s = 5, 20 ICP steps, then ICP at k = 100 and 300."""
-        return cls(k_max=300, refinement="icp", icp_tolerance=0.0)
+        return cls(k_quotient=0, k_max=300, refinement="icp", icp_tolerance=0.0)
 
     def changed(self, **values: object) -> "MatchParameters":
         """A copy with some values changed, checked again."""

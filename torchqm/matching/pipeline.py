@@ -44,6 +44,7 @@ def match(
     method: str = "quotient",
     parameters: MatchParameters | None = None,
     listener: StepListener | None = None,
+    cache_dir: str | Path | None = None,
 ) -> MatchResult:
     """All the equally good dense maps from one shape to another.
 
@@ -64,6 +65,7 @@ def match(
             (section 5 alone: the symmetry of the source is used only to choose between the two points of an orbit).
         parameters: numbers of the method; by default those that belong to ``method``.
         listener: told of each step; see :data:`torchqm.matching.steps.StepListener`.
+        cache_dir: folder of eigenpairs; see :func:`torchqm.matching.shape.prepare`.
 
     Returns:
         The maps, source vertex to target vertex, with labels, scores, functional maps, warnings and timings.
@@ -76,7 +78,7 @@ def match(
     References:
         Paper, Algorithm 1 and sections 5 to 7.
     """
-    collection = Collection(reference, method, parameters, listener)
+    collection = Collection(reference, method, parameters, listener, cache_dir)
     return collection.match(source, target, symmetry, symmetry_source)
 
 
@@ -88,6 +90,7 @@ def find_symmetry(
     listener: StepListener | None = None,
     method: str = "quotient",
     symmetry: str = "auto",
+    cache_dir: str | Path | None = None,
 ) -> SymmetryResult:
     """The symmetries of a shape: from its own mirror planes or spectrum, or transferred from an undeformed reference.
 
@@ -99,6 +102,7 @@ def find_symmetry(
         method: whose way of transfer: ``quotient`` or ``paper``.
         symmetry: without a reference: ``auto`` (mirror planes if they fit firmly, else the spectrum), ``extrinsic``
             (mirror planes alone) or ``detect`` (spectrum alone).
+        cache_dir: folder of eigenpairs; see :func:`torchqm.matching.shape.prepare`.
 
     Returns:
         The group, its name in ``details["group"]``; trivial, with a warning that gives the numbers, if nothing was
@@ -106,7 +110,7 @@ def find_symmetry(
     """
     if symmetry not in SYMMETRIES[:3]:
         raise ValueError(f"symmetry={symmetry!r}: allowed are {', '.join(SYMMETRIES[:3])}")
-    collection = Collection(reference, method, parameters, listener)
+    collection = Collection(reference, method, parameters, listener, cache_dir)
     mesh = collection.load(mesh)
     collection.steps.total = collection.expected_work(mesh, match=False)
     shape = collection.shape(mesh)
@@ -151,7 +155,7 @@ class Collection:
         method: one of :data:`METHODS`.
         parameters: by default those of the method.
         listener: told of each step.
-        cost: expected work, for the share of it that the listener is told.
+        cache_dir: folder of eigenpairs; see :func:`torchqm.matching.shape.prepare`.
     """
 
     def __init__(
@@ -160,10 +164,12 @@ class Collection:
         method: str = "quotient",
         parameters: MatchParameters | None = None,
         listener: StepListener | None = None,
+        cache_dir: str | Path | None = None,
     ) -> None:
         if method not in METHODS:
             raise ValueError(f"method={method!r}: allowed are {', '.join(METHODS)}")
         self.method = method
+        self.cache_dir = cache_dir
         self.parameters = parameters or (MatchParameters() if method == "quotient" else MatchParameters.paper())
         self.steps = Steps(listener=listener)
         self.way = "full_map" if method == "quotient" else "clustering"
@@ -191,8 +197,8 @@ class Collection:
         mesh = self.load(mesh)
         if id(mesh) not in self._shapes:
             with self.steps(f"eigenpairs of {mesh.name}", COST["eigenpairs"] * mesh.n_verts / 1000):
-                k = self.parameters.k_max
-                prepared = prepare(mesh, k, max(self.parameters.n_samples, N_ANCHORS), self.parameters.seed)
+                p = self.parameters
+                prepared = prepare(mesh, p.k_max, max(p.n_samples, N_ANCHORS), p.seed, cache_dir=self.cache_dir)
             self._shapes[id(mesh)] = (mesh, prepared)  # the mesh is kept so that its id stays its own
         return self._shapes[id(mesh)][1]
 

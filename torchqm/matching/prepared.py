@@ -6,6 +6,7 @@ import torch
 
 from torchqm.fmap.convert import p2p_to_fmap
 from torchqm.fmap.refine import correspondence_fmap
+from torchqm.matching.candidates import full_map_from_blocks
 from torchqm.matching.initial import basis_size
 from torchqm.matching.known import KnownSymmetry, no_symmetry
 from torchqm.matching.orbits import full_map_from_orbits, quotient_size
@@ -16,7 +17,6 @@ from torchqm.matching.quotient import (
     dense_map,
     match_quotient,
     refine_by_icp,
-    refine_by_odd_block,
     refine_fmap,
 )
 from torchqm.matching.result import MatchResult
@@ -89,8 +89,10 @@ def match_prepared(
                 details |= {"orbit_residual": orbits.residual}
                 fmap = refine_fmap(orbits.fmap, x, y, parameters)
             elif method == "quotient" and oriented:
-                fmap, odd = refine_by_odd_block(found, x, y, parameters)
+                full = full_map_from_blocks(found, x, y, known_x, known_y, parameters)
+                fmap, odd, even = full.fmap, full.odd, full.quotient.fmap
                 details |= {"residual_direct": odd.residual_direct, "residual_mirrored": odd.residual_mirrored}
+                details |= {"candidate_scores": list(full.scores)}
                 separated = odd.separated
             else:
                 halves = choose_halves(found.orbit_map(x, y), known_y.group, known_x.sign, known_y.sign)

@@ -3,22 +3,21 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchqm.fmap.convert import nearest_used
 from torchqm.fmap.refine import nearest_isometry
 from torchqm.matching.landmark_maps import LandmarkMaps
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.parity import parity_patterns
+from torchqm.matching.quality import distance_change
 from torchqm.matching.self_map import grow_self_map, nearest_involution, reflection_score
 from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.descriptors import wave_energies, wave_kernel_signature
 from torchqm.symmetry.landmarks import find_landmarks, landmark_permutations
 from torchqm.symmetry.orientation import orientation_cosine, orientation_tensor
 
-__all__ = ["SAME", "Judge", "Proposal", "correlation", "different", "distortion", "grown", "propose", "regrown"]
+__all__ = ["SAME", "Judge", "Proposal", "correlation", "different", "grown", "propose", "regrown"]
 
 VARIANTS: tuple[tuple[int, tuple[float, ...], tuple[tuple[float, float, float], ...]], ...] = (
     (60, (1.0, 2.0), ((0.1, 1.0, 1.0), (0.1, 0.3, 1.0))),
@@ -159,30 +158,10 @@ def _ranked(pool: list[Proposal], x: PreparedShape) -> list[Proposal]:
     limit = CLOSE * min((p.score for p in pool), default=0.0)
 
     def key(proposal: Proposal) -> float:
-        more = DISTORTED * distortion(x, proposal.fmap) if proposal.score <= limit else DISTORTED
+        more = DISTORTED * distance_change(proposal.fmap, x, x) if proposal.score <= limit else DISTORTED
         return proposal.score * (1.3 if proposal.orientation > 0 else 1.0) + more
 
     return sorted(pool, key=key)
-
-
-def distortion(x: PreparedShape, fmap: Float[Tensor, "K K"], n: int = 1000) -> float:
-    """Mean change of the biharmonic distance between two samples under a self-map, relative to the mean distance.
-
-    Args:
-        x: the shape.
-        fmap: in its first K functions.
-        n: samples; each is compared with two others, far apart in their (random) order.
-    """
-    basis, samples = x.basis.truncate(fmap.shape[0]), x.samples[:n]
-    partners = x.anchors[nearest_used(basis.evecs[samples] @ fmap.T, basis.restricted(x.anchors))]
-    small = x.basis.truncate(min(100, x.basis.k))
-    places = small.evecs[:, 1:] / small.evals[1:].clamp_min(torch.finfo(small.evals.dtype).tiny)
-    before, after = places[samples], places[partners]
-    gaps = []
-    for step in (len(samples) // 3, len(samples) // 2 + 1):
-        gaps.append(((before - before.roll(step, 0)).norm(dim=1), (after - after.roll(step, 0)).norm(dim=1)))
-    change = sum(float((b - a).abs().mean()) for b, a in gaps)
-    return change / max(sum(float(b.mean()) for b, _ in gaps), 1e-300)
 
 
 def _by_score(proposal: Proposal) -> float:

@@ -1,14 +1,15 @@
-"""What a map says about itself, without any ground truth: commutativity and orientation."""
+"""What a map says about itself, without any ground truth: commutativity, distances and orientation."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchqm.fmap.convert import p2p_to_fmap
+from torchqm.fmap.convert import nearest_used, p2p_to_fmap
 from torchqm.geometry.mesh import Mesh
+from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.basis import SpectralBasis
 
-__all__ = ["commutativity_score", "commutator_norm", "orientation_agreement", "torn_length"]
+__all__ = ["commutativity_score", "commutator_norm", "distance_change", "orientation_agreement", "torn_length"]
 
 
 def commutativity_score(
@@ -33,6 +34,35 @@ def commutator_norm(
     """``|| C Delta_x - Delta_y C || / (|| C Delta_x || + || Delta_y C ||)`` of a functional map; 0: an isometry."""
     right, left = fmap_xy * evals_x, evals_y[:, None] * fmap_xy
     return float((right - left).norm() / (right.norm() + left.norm()).clamp_min(1e-300))
+
+
+def distance_change(
+    fmap_xy: Float[Tensor, "Ky Kx"], x: PreparedShape, y: PreparedShape, n: int = 1000, k: int = 100
+) -> float:
+    """Mean change of the biharmonic distance between two samples under a map, relative to the mean distance.
+
+    Args:
+        fmap_xy: in the first functions of the two shapes.
+        x: source.
+        y: target; partners are looked for among its anchors.
+        n: samples; each is compared with two others, far apart in their (random) order.
+        k: functions in the distances.
+    """
+    k_y, k_x = fmap_xy.shape
+    samples = x.samples[:n]
+    among = y.basis.truncate(k_y).restricted(y.anchors)
+    partners = y.anchors[nearest_used(x.basis.evecs[samples, :k_x] @ fmap_xy.T, among)]
+    before, after = _biharmonic(x.basis, k)[samples], _biharmonic(y.basis, k)[partners]
+    gaps = []
+    for step in (len(samples) // 3, len(samples) // 2 + 1):
+        gaps.append(((before - before.roll(step, 0)).norm(dim=1), (after - after.roll(step, 0)).norm(dim=1)))
+    change = sum(float((b - a).abs().mean()) for b, a in gaps)
+    return change / max(sum(float(b.mean()) for b, _ in gaps), 1e-300)
+
+
+def _biharmonic(basis: SpectralBasis, k: int) -> Float[Tensor, "V D"]:
+    small = basis.truncate(min(k, basis.k))
+    return small.evecs[:, 1:] / small.evals[1:].clamp_min(torch.finfo(small.evals.dtype).tiny)
 
 
 def orientation_agreement(mesh_x: Mesh, mesh_y: Mesh, p2p_xy: Int[Tensor, " Vx"]) -> float:

@@ -8,10 +8,11 @@ from torch import Tensor
 
 from torchqm.fmap.convert import fmap_to_p2p
 from torchqm.fmap.refine import correspondence_fmap, growing_sizes, quotient_icp, upsample
+from torchqm.fmap.two_way import Places, two_way_upsample
 from torchqm.matching.initial import basis_size, initial_fmap, shared_descriptors
-from torchqm.matching.odd import OddMap, join_blocks, solve_odd
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.shape import PreparedShape
+from torchqm.spectral.features import local_features
 from torchqm.symmetry.basis import SymmetrizedBasis, symmetrized_basis
 from torchqm.symmetry.group import SymmetryGroup
 
@@ -20,8 +21,8 @@ __all__ = [
     "choose_halves",
     "dense_map",
     "match_quotient",
+    "pair_places",
     "refine_by_icp",
-    "refine_by_odd_block",
     "refine_fmap",
 ]
 
@@ -35,12 +36,19 @@ class QuotientMatch:
         target: the target's basis, split.
         fmap: ``(K+_y, K+_x)`` the even block C+.
         time: diffusion time of the deltas.
+        first: the least-squares map that ``fmap`` began at, if it is of the same size.
     """
 
     source: SymmetrizedBasis
     target: SymmetrizedBasis
     fmap: Float[Tensor, "Key Kex"]
     time: float = 0.0
+    first: Float[Tensor, "Key Kex"] | None = None
+
+    @property
+    def initial(self) -> Float[Tensor, "Key Kex"]:
+        """The map before quotient ICP."""
+        return self.fmap if self.first is None else self.first
 
     def orbit_map(self, x: PreparedShape, y: PreparedShape) -> Int[Tensor, " Vx"]:
         """The point-to-orbit map: for each source vertex a target vertex whose *orbit* is the image (section 4.4).
@@ -75,12 +83,12 @@ def match_quotient(
     source = symmetrized_basis(x.basis.truncate(k), group_x)
     target = symmetrized_basis(y.basis.truncate(k), group_y)
     values_x, values_y = shared_descriptors([x.basis, y.basis], parameters)
-    fmap = initial_fmap(source.even, target.even, values_x, values_y, parameters.commutativity)
+    first = initial_fmap(source.even, target.even, values_x, values_y, parameters.commutativity)
     samples, among = x.samples[: parameters.n_samples], target.even.restricted(y.anchors)
     fmap = quotient_icp(
-        fmap, source.even, among, samples, parameters.icp_steps, parameters.time, tolerance=parameters.icp_tolerance
+        first, source.even, among, samples, parameters.icp_steps, parameters.time, tolerance=parameters.icp_tolerance
     )
-    return QuotientMatch(source, target, fmap, parameters.time)
+    return QuotientMatch(source, target, fmap, parameters.time, first)
 
 
 def choose_halves(
@@ -128,42 +136,46 @@ def refine_by_icp(
     return _icp_at_100_and(fmap, x, y, parameters)
 
 
-def refine_by_odd_block(
-    match: QuotientMatch, x: PreparedShape, y: PreparedShape, parameters: MatchParameters
-) -> tuple[Float[Tensor, "K K"], OddMap]:
-    """The odd block from orientation, joined with the even one, and the full map refined by spectral upsampling.
-
-    Args:
-        match: the even block at ``parameters.k``.
-        x: source, consistently oriented.
-        y: target, likewise.
-        parameters: ``k_max``, ``growth``, ``n_samples`` are used.
-
-    Returns:
-        The orientation-preserving functional map at ``k_max``, and the odd block with its two residuals.
-    """
-    odd = solve_odd(
-        x.mesh, y.mesh, match.source.even, match.target.even, match.fmap, match.source.odd, match.target.odd
-    )
-    fmap = join_blocks(match.source, match.target, match.fmap, odd.fmap)
-    return refine_fmap(fmap, x, y, parameters), odd
-
-
 def refine_fmap(
-    fmap: Float[Tensor, "K0 K0"], x: PreparedShape, y: PreparedShape, parameters: MatchParameters
+    fmap: Float[Tensor, "K0 K0"],
+    x: PreparedShape,
+    y: PreparedShape,
+    parameters: MatchParameters,
+    places: tuple[Places, Places] | None = None,
 ) -> Float[Tensor, "K K"]:
     """The last refinement of a full map, by the way that ``parameters.refinement`` names, up to ``k_max`` functions.
 
     ``none`` leaves the map as it is, ``icp`` iterates at k = 100 and at ``k_max`` (section 7.4), ``upsample`` grows the
-    basis step by step.
+    basis step by step and looks for partners both ways (:func:`torchqm.fmap.two_way.two_way_upsample`) between
+    ``places``, which are made if they are not given (:func:`pair_places`).
     """
     k_max = min(parameters.k_max, x.basis.k, y.basis.k)
     if parameters.refinement == "none" or k_max <= fmap.shape[0]:
         return fmap
     if parameters.refinement == "icp":
         return _icp_at_100_and(fmap, x, y, parameters)
-    sizes = growing_sizes(fmap.shape[0], k_max, parameters.growth)
-    return upsample(fmap, x.basis, y.basis.restricted(y.anchors), x.samples[: parameters.n_samples], sizes)
+    on_x, on_y = pair_places(x, y, parameters) if places is None else places
+    sizes = [(k, k) for k in growing_sizes(fmap.shape[0], k_max, parameters.growth)]
+    return two_way_upsample(fmap, x.basis, y.basis, on_x, on_y, sizes, parameters.local_weight)
+
+
+def pair_places(x: PreparedShape, y: PreparedShape, parameters: MatchParameters) -> tuple[Places, Places]:
+    """The anchors of two shapes with local features that are comparable between them.
+
+    Args:
+        x: one shape.
+        y: the other.
+        parameters: ``local_weight`` (0: there are no features), ``n_samples``, ``k_max`` are used.
+    """
+    ids = [x.anchors, y.anchors]
+    if parameters.local_weight == 0:
+        features = [torch.zeros(len(i), 0, dtype=x.basis.evecs.dtype) for i in ids]
+    else:
+        bases = [s.basis.truncate(min(parameters.k_max, s.basis.k)) for s in (x, y)]
+        oriented = x.oriented and y.oriented
+        features = local_features(bases, [x.curvature, y.curvature], ids, oriented)
+    first, second = (Places(i, f, parameters.n_samples) for i, f in zip(ids, features, strict=True))
+    return first, second
 
 
 def _icp_at_100_and(

@@ -10,15 +10,18 @@ from torch import Tensor
 from torchqm.fmap.convert import nearest_used, p2p_to_fmap
 from torchqm.fmap.refine import growing_sizes, nearest_isometry, quotient_icp, upsample
 from torchqm.fmap.solve import solve_fmap
+from torchqm.fmap.two_way import growing_pairs, two_way_upsample
 from torchqm.matching.initial import basis_size, shared_descriptors, unit_columns_pair
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.quality import commutator_norm
+from torchqm.matching.quotient import pair_places
 from torchqm.matching.shape import N_ANCHORS, PreparedShape
 from torchqm.symmetry.group import SymmetryGroup
 
 __all__ = [
     "SelfMap",
     "best_self_map",
+    "settled_self_map",
     "conjugate_reflection",
     "grow_self_map",
     "nearest_involution",
@@ -162,6 +165,36 @@ def _images(fmap: Tensor, x: PreparedShape, parameters: MatchParameters) -> Tens
     small = x.basis.truncate(fmap.shape[0])
     partners = nearest_used(small.evecs[x.samples[: parameters.n_samples]] @ fmap.T, small.restricted(x.anchors))
     return x.mesh.verts[x.anchors[partners]]
+
+
+def settled_self_map(
+    fmap: Float[Tensor, "K K"],
+    x: PreparedShape,
+    parameters: MatchParameters,
+    involution: bool = True,
+    start: int = 60,
+    weight: float = 1.0,
+) -> Float[Tensor, "K2 K2"]:
+    """Grow a good self-map once more from its first functions, held in its place by local features.
+
+    Only for maps that were chosen already: features make a wrong map look better than it is. Half the weight that they
+    have between two shapes, as a shape is more like itself in wrong places than like another one.
+
+    Args:
+        fmap: in the first K functions.
+        x: the shape.
+        parameters: ``growth``, ``k_max``, ``n_samples`` are used.
+        involution: whether it is one, and is made one after each step.
+        start: functions that are kept.
+        weight: of the features (:func:`torchqm.fmap.two_way.two_way_upsample`).
+    """
+    places, _ = pair_places(x, x, parameters)
+    start, k = min(start, fmap.shape[0]), min(parameters.k_max, x.basis.k)
+    project = nearest_involution if involution else nearest_isometry
+    sizes = growing_pairs((start, start), (max(start, k), max(start, k)), parameters.growth)
+    return two_way_upsample(
+        project(fmap[:start, :start]), x.basis, x.basis, places, places, sizes, weight, project, back=not involution
+    )
 
 
 def nearest_involution(matrix: Float[Tensor, "K K"]) -> Float[Tensor, "K K"]:

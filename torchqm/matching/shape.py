@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.fmap.nearest import SurfaceSearch
@@ -13,7 +14,9 @@ from torchqm.geometry.laplacian import laplacian
 from torchqm.geometry.mesh import Mesh
 from torchqm.geometry.sampling import area_samples
 from torchqm.spectral.basis import SpectralBasis
+from torchqm.spectral.cache import cache_folder, cached_basis
 from torchqm.spectral.eigen import eigenbasis
+from torchqm.spectral.features import smooth_curvature
 
 __all__ = ["N_ANCHORS", "PreparedShape", "prepare"]
 
@@ -54,6 +57,11 @@ class PreparedShape:
         return self.samples[:N_ANCHORS]
 
     @cached_property
+    def curvature(self) -> Float[Tensor, " V"]:
+        """Smooth mean curvature (:func:`torchqm.spectral.features.smooth_curvature`)."""
+        return smooth_curvature(self.mesh)
+
+    @cached_property
     def search(self) -> SurfaceSearch | None:
         """Two-stage search for dense maps onto this shape; None where it is small enough to compare all vertices."""
         if self.n_verts < 2 * N_ANCHORS or len(self.samples) < N_ANCHORS:
@@ -69,6 +77,7 @@ def prepare(
     seed: int = 0,
     kind: str = "auto",
     basis: SpectralBasis | None = None,
+    cache_dir: str | Path | None = None,
 ) -> PreparedShape:
     """Scale a mesh to unit area and compute its first ``k`` eigenpairs.
 
@@ -79,19 +88,27 @@ def prepare(
         seed: of the samples.
         kind: Laplacian, see :func:`torchqm.geometry.laplacian.laplacian`.
         basis: eigenpairs of ``mesh.normalized()`` from an earlier run, to be used instead of computing them.
+        cache_dir: folder of the spectral cache, where they are read from or kept; by default that of the environment
+            variable ``TORCHQM_CACHE``, else nothing is kept. See :func:`torchqm.spectral.cache.cached_basis`.
 
     Raises:
         SpectrumError: fewer than ``k`` vertices with area.
     """
     report = inspect_mesh(mesh)
-    operator = laplacian(mesh.normalized(), kind, report)
     unit, oriented, warnings = _outward(mesh, report)
-    basis = eigenbasis(operator, k, mesh.label) if basis is None else basis.truncate(k)
+    problems: tuple[str, ...] = ()
+    if basis is None and cache_folder(cache_dir) is not None:
+        kept = cached_basis(mesh, k, kind, cache_dir, whole_clusters=False, warn=False)
+        basis, problems = kept.scaled(mesh.area**-0.5), kept.report.problems
+        origin = f"{kept.report.source}{', from the cache' if kept.report.outcome == 'read' else ''}"
+        operator = f"{kept.report.kind}: {kept.report.reason}; eigenpairs: {origin}"
+    else:
+        chosen = laplacian(mesh.normalized(), kind, report)
+        basis = eigenbasis(chosen, k, mesh.label) if basis is None else basis.truncate(k)
+        operator = f"{chosen.kind}: {chosen.reason}"
     samples = area_samples(unit, min(n_samples, int((unit.vertex_areas > 0).sum())), seed)
-    warnings = [*report.warnings, *(f"{mesh.label}: {text}" for text in warnings)]
-    return PreparedShape(
-        unit, basis, samples, mesh.area**0.5, f"{operator.kind}: {operator.reason}", oriented, warnings
-    )
+    warnings = [*report.warnings, *(f"{mesh.label}: {text}" for text in warnings), *problems]
+    return PreparedShape(unit, basis, samples, mesh.area**0.5, operator, oriented, warnings)
 
 
 def _outward(mesh: Mesh, report: MeshReport) -> tuple[Mesh, bool, list[str]]:

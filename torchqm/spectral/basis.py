@@ -60,6 +60,16 @@ class SpectralBasis:
             raise ValueError(f"k={k}: this basis can be cut at 1..{self.k} functions")
         return self if k == self.k else SpectralBasis(self.evals[:k], self.evecs[:, :k], self.mass)
 
+    def scaled(self, factor: float) -> "SpectralBasis":
+        """The basis of the same shape with all lengths multiplied by ``factor`` (the Laplacian has the unit 1 / area).
+
+        Example:
+            >>> basis = SpectralBasis(torch.ones(1), torch.ones(4, 1), torch.full((4,), 0.25)).scaled(2.0)
+            >>> basis.evals.item(), basis.evecs[0].item(), basis.mass.sum().item()
+            (0.25, 0.5, 4.0)
+        """
+        return SpectralBasis(self.evals / factor**2, self.evecs / factor, self.mass * factor**2)
+
     def restricted(self, ids: Int[Tensor, " S"]) -> "SpectralBasis":
         """The same functions at some of the vertices only, for searches among these; no longer orthonormal."""
         return SpectralBasis(self.evals, self.evecs[ids], self.mass[ids])

@@ -1,0 +1,118 @@
+"""Refinement that looks for partners both ways, and wants them to look alike: less drift than spectral upsampling."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchqm.fmap.nearest import nearest_rows
+from torchqm.fmap.refine import FMap, growing_sizes, nearest_isometry
+from torchqm.spectral.basis import SpectralBasis
+
+__all__ = ["Places", "growing_pairs", "two_way_upsample"]
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Points of a shape that take part in a two-way search, and what they look like.
+
+    Args:
+        ids: ``(S,)`` vertex ids, drawn by area: any first part is a sample, too.
+        features: ``(S, D)`` coordinates that are close where two shapes look alike; D = 0 leaves them out.
+        n_queries: the first so many look for a partner; all of them are looked at.
+
+    Raises:
+        ValueError: numbers of ids and features differ.
+    """
+
+    ids: Int[Tensor, " S"]
+    features: Float[Tensor, "S D"]
+    n_queries: int
+
+    def __post_init__(self) -> None:
+        if len(self.ids) != len(self.features):
+            raise ValueError(f"{len(self.ids)} ids, but features of {len(self.features)} points")
+
+    def fewer(self, n_queries: int, n_points: int) -> "Places":
+        """The first of them."""
+        return Places(self.ids[:n_points], self.features[:n_points], min(n_queries, n_points, self.n_queries))
+
+    def inside(self, region: Bool[Tensor, " V"]) -> "Places":
+        """Those in a region of the shape, such as one fundamental domain; as many queries as before, if it has them."""
+        kept = region[self.ids]
+        return Places(self.ids[kept], self.features[kept], min(self.n_queries, int(kept.sum())))
+
+
+def two_way_upsample(
+    fmap_xy: FMap,
+    basis_x: SpectralBasis,
+    basis_y: SpectralBasis,
+    places_x: Places,
+    places_y: Places,
+    sizes: Sequence[tuple[int, int]],
+    weight: float = 2.0,
+    project: Callable[[Tensor], Tensor] = nearest_isometry,
+    back: bool = True,
+) -> Float[Tensor, "Ly Lx"]:
+    """Spectral upsampling with partners of x on y and of y on x, near in spectral coordinates and alike in features.
+
+    With ``C`` between the first m functions, the partner of x is ``argmin_y || C phi(x) - phi(y) ||^2 + w^2 m || d(x) -
+    d(y) ||^2``, that of y is found with ``C^T``; the next map is the isometry nearest to the sum of both correspondence
+    matrices in more functions. Commutativity alone has many fixed points near the true map of a real pose, and one-way
+    upsampling stops at one of them even if it begins at the truth; features hold it in its place.
+
+    Args:
+        fmap_xy: initial map between the first functions of the bases.
+        basis_x: basis of x, full or even.
+        basis_y: basis of y, likewise.
+        places_x: points of x, with features of root mean square length 1.
+        places_y: points of y.
+        sizes: functions of y and of x, one pair after the other.
+        weight: w; 0 leaves the features out.
+        project: what is made of the correspondence matrix at each step.
+        back: whether the points of y look for partners, too; of an involution they would find the same ones.
+
+    Returns:
+        The map at the last size.
+
+    Raises:
+        ValueError: a size that a basis does not have, or a negative weight.
+
+    References:
+        Melzi et al. 2019 for the growing basis; Ren et al. 2018, section 5.1 for searching both ways.
+    """
+    if weight < 0:
+        raise ValueError(f"weight={weight}: must not be negative")
+    for size_y, size_x in sizes:
+        if size_y > basis_y.k or size_x > basis_x.k:
+            raise ValueError(f"sizes ({size_y}, {size_x}): the bases have {basis_y.k} and {basis_x.k} functions")
+    at_x, at_y = basis_x.evecs[places_x.ids], basis_y.evecs[places_y.ids]
+    n_x, n_y = places_x.n_queries, places_y.n_queries
+    for size_y, size_x in sizes:
+        k_y, k_x = fmap_xy.shape
+        look_x, look_y = (weight * k_y**0.5 * p.features for p in (places_x, places_y))
+        points_x, points_y = torch.cat([at_x[:, :k_x], look_x], 1), torch.cat([at_y[:, :k_y], look_y], 1)
+        on_y = nearest_rows(torch.cat([at_x[:n_x, :k_x] @ fmap_xy.T, look_x[:n_x]], 1), points_y)
+        found = at_y[on_y, :size_y].T @ at_x[:n_x, :size_x] / n_x
+        if back:
+            on_x = nearest_rows(torch.cat([at_y[:n_y, :k_y] @ fmap_xy, look_y[:n_y]], 1), points_x)
+            found = found + at_y[:n_y, :size_y].T @ at_x[on_x, :size_x] / n_y
+        fmap_xy = project(found)
+    return fmap_xy
+
+
+def growing_pairs(start: tuple[int, int], stop: tuple[int, int], ratio: float = 1.2) -> list[tuple[int, int]]:
+    """:func:`torchqm.fmap.refine.growing_sizes` for two bases at once, each as far as it goes.
+
+    Example:
+        >>> growing_pairs((10, 12), (20, 15), 1.5)
+        [(15, 15), (20, 15)]
+    """
+    one, other = (growing_sizes(a, b, ratio) or [b] for a, b in zip(start, stop, strict=True))
+    length = max(len(one), len(other))
+    if start == stop:
+        return []
+    one, other = (s + [s[-1]] * (length - len(s)) for s in (one, other))
+    return list(zip(one, other, strict=True))
