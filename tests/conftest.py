@@ -1,11 +1,13 @@
 """What all tests share: run-time type checks, one thread, a fixed Hypothesis profile, shapes with exact answers."""
 
 import importlib
+import os
 import sys
 from pathlib import Path
 
 from jaxtyping import install_import_hook
 
+os.environ.pop("TORCHQM_CACHE", None)  # a developer's cache must not steer the tests
 sys.path.insert(0, str(Path(__file__).parent))  # for `references`
 # Before anything imports torchqm: annotations of its functions become checks, in the tests only.
 importlib.import_module("references.checker")

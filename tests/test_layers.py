@@ -19,7 +19,10 @@ def test_layer_contract():
     assert run.returncode == 0, run.stdout + run.stderr
 
 
-HEAVY = "matplotlib", "gudhi", "sklearn", "skimage", "trimesh", "potpourri3d", "faiss", "robust_laplacian"
+HEAVY = (
+    *("matplotlib", "gudhi", "sklearn", "skimage", "trimesh", "potpourri3d", "faiss", "robust_laplacian"),
+    *("torchmetrics", "yaml"),
+)
 
 
 @pytest.mark.parametrize(

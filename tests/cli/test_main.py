@@ -20,7 +20,7 @@ def test_version(capsys):
     assert capsys.readouterr().out == f"torchqm {__version__}\n"
 
 
-@pytest.mark.parametrize("command", [[], ["demo"], ["match"], ["symmetry"]])
+@pytest.mark.parametrize("command", [[], ["demo"], ["match"], ["symmetry"], ["prepare"]])
 def test_help_exits_with_0_and_fits_a_terminal(command, capsys):
     with pytest.raises(SystemExit) as stop:
         main([*command, "--help"])

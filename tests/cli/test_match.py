@@ -55,6 +55,28 @@ def test_both_maps_are_found_and_written(pair, tmp_path, capsys, symmetry):
     assert not (tmp_path / "out" / "match.png").exists()
 
 
+def test_prepared_eigenpairs_are_used_and_change_nothing(pair, tmp_path, monkeypatch):
+    folder, _ = pair
+    cache = tmp_path / "cache"
+    argv = ["prepare", str(folder), "--k", "40", "--cache", str(cache), "--jobs", "1"]
+    assert main(argv) == 0
+    entries = {path.name: path.stat().st_mtime_ns for path in cache.glob("*.npz")}
+    assert len(entries) == 3
+    monkeypatch.setattr("torchqm.spectral.cache.eigenbasis", None)  # nothing can be computed
+    assert run(pair, tmp_path, "--cache", cache) == 0
+    assert {path.name: path.stat().st_mtime_ns for path in cache.glob("*.npz")} == entries
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["details"]["source"]["laplacian"].endswith(", from the cache")
+    with np.load(tmp_path / "out" / "match.npz") as saved:
+        maps = saved["maps"]
+    argv = ["symmetry", str(folder / "x.off"), "--cache", str(cache), "--out", str(tmp_path / "symmetry"), *FAST]
+    assert main(argv) == 0
+    monkeypatch.undo()
+    assert run(pair, tmp_path) == 0
+    with np.load(tmp_path / "out" / "match.npz") as saved:
+        assert saved["maps"].tolist() == maps.tolist()
+
+
 def test_summary_has_what_is_needed_to_judge_and_repeat_the_run(pair, tmp_path):
     assert run(pair, tmp_path, "--k", "20", "--seed", "3") == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())

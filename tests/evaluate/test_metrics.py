@@ -77,9 +77,52 @@ def test_only_the_rows_of_the_true_points_are_computed(square: Mesh, monkeypatch
 def test_rows_are_computed_in_chunks(square: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = TruthDistances.build(square, torch.arange(9))
     asked = count_calls(monkeypatch)
-    monkeypatch.setattr("torchqm.evaluate.metrics._CHUNK_BYTES", 4 * 8 * 9)
+    monkeypatch.setattr("torchqm.evaluate.distances._CHUNK_BYTES", 4 * 8 * 9)
     assert torch.equal(TruthDistances.build(square, torch.arange(9)).rows, whole.rows)
     assert asked == [[0, 1, 2, 3], [4, 5, 6, 7], [8]]
+
+
+def test_a_truth_at_all_vertices_keeps_no_rows(square: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    p2p = torch.tensor([4, 1, 0, 3, 8, 5, 2, 7, 6])
+    kept = geodesic_errors(square, p2p, group_truth(torch.arange(9), MIRROR))
+    inside = SurfacePoints(square.faces[[0, 3, 5]], torch.tensor([[0.2, 0.3, 0.5]]).repeat(3, 1))
+    kept_inside = geodesic_errors(square, p2p, inside, at=torch.tensor([0, 4, 8]))
+    asked = count_calls(monkeypatch)
+    monkeypatch.setattr("torchqm.evaluate.metrics.MAX_ROWS_BYTES", 4 * 2 * 9)  # of two vertices
+    monkeypatch.setattr("torchqm.evaluate.distances._CHUNK_BYTES", 3 * 8 * 9)
+    streamed = geodesic_errors(square, p2p, group_truth(torch.arange(9), MIRROR))
+    assert torch.allclose(streamed, kept, rtol=1e-6, atol=0)
+    assert max(len(sources) for sources in asked) == 3
+    assert sorted(v for sources in asked for v in sources) == [0, 2, 3, 4, 5, 6, 8]  # 1 and 7 went where they should
+    assert torch.allclose(geodesic_errors(square, p2p, inside, at=torch.tensor([0, 4, 8])), kept_inside, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"9 true vertices of square take .* GiB.*spread_points"):
+        TruthDistances.build(square, torch.arange(9))
+    assert TruthDistances.build(square, torch.arange(2)).rows.shape == (2, 9)
+
+
+def test_fifty_two_thousand_vertices_do_not_fit_as_a_matrix(square: Mesh) -> None:
+    """What TOSCA's largest meshes may keep, without making any of it."""
+    large = Mesh(torch.zeros(52_565, 3, dtype=torch.float64), square.faces, "david")
+    assert not TruthDistances.fits(large, torch.arange(52_565))
+    assert TruthDistances.fits(large, torch.arange(2 * 1024))
+
+
+def test_a_distance_matrix_at_hand_is_taken_as_it_is(square: Mesh) -> None:
+    matrix = torch.rand(9, 9, generator=torch.Generator().manual_seed(0))
+    given = TruthDistances(square, torch.arange(9), matrix, square.area**0.5, "given")
+    truth = torch.tensor([3, 3, 8])
+    errors = geodesic_errors(square, torch.tensor([5, 3, 0]), truth, distances=given)
+    assert torch.equal(errors, matrix[truth, torch.tensor([5, 3, 0])].double() / 2)
+
+
+def test_points_inside_faces_have_images_under_a_group(square: Mesh) -> None:
+    bary = torch.tensor([[0.5, 0.25, 0.25], [1.0, 0.0, 0.0]])
+    images = group_truth(SurfacePoints(square.faces[:2], bary), MIRROR)
+    assert isinstance(images, SurfacePoints)
+    positions = (square.verts[images.corners] * images.bary[..., None]).sum(-2)
+    assert torch.equal(positions[1], positions[0] * torch.tensor([-1.0, 1, 1]) + torch.tensor([2.0, 0, 0]))
+    assert torch.equal(images.corners[0], square.faces[:2])
+    assert torch.equal(images.bary, bary.repeat(2, 1, 1))
 
 
 def test_truth_inside_a_face(square: Mesh) -> None:

@@ -14,7 +14,6 @@ from torchqm.evaluate.protocol import (
     evaluate_errors,
     flip_rate,
     make_report,
-    summarize,
 )
 
 # A map that is mirrored but for one point (column 2); column 3 lies on the axis.
@@ -109,26 +108,21 @@ def test_forgiving_more_never_costs(rows: list[list[float]]) -> None:
     assert flip_rate(errors).patches <= 1
 
 
-def test_summary_counts_every_pair_once() -> None:
-    reports = [
-        make_report("map", torch.tensor([0.0, 0.0, 0.0, 0.0], dtype=torch.float64)),
-        make_report("map", torch.tensor([0.3], dtype=torch.float64)),
-    ]
-    summary = summarize(reports)
-    assert summary.n_pairs == 2
-    assert summary.mean == summary.median == pytest.approx(0.15)
-    assert summary.worst == 0.3
-    assert summary.share_below == {0.05: 0.5, 0.1: 0.5, 0.25: 0.5}
-    with pytest.raises(ValueError, match="one protocol"):
-        summarize([*reports, make_report("plain", torch.tensor([0.3]))])
-    with pytest.raises(ValueError, match="none"):
-        summarize([])
+def test_reports_go_into_json_and_rows() -> None:
+    report = evaluate_errors(MIRRORED, "map", solver="heat")
+    kept = json.loads(json.dumps(report.to_dict()))
+    assert kept["share_below"]["0.05"] == 0.75
+    assert kept["solver"] == "heat"
+    row = report.to_row()
+    assert list(row) == [f"map_{key}" for key in ("mean", "median", "auc", "below_0.05", "below_0.1", "below_0.25")]
+    assert (row["map_mean"], row["map_below_0.25"]) == (report.mean, 0.75)
 
 
-def test_reports_and_summaries_go_into_json() -> None:
-    report = evaluate_errors(MIRRORED, "map")
-    assert json.loads(json.dumps(report.to_dict()))["share_below"]["0.05"] == 0.75
-    assert json.loads(json.dumps(summarize([report]).to_dict()))["n_pairs"] == 1
+def test_the_curve_of_a_report_counts_what_its_shares_count() -> None:
+    weights = torch.tensor([1.0, 2.0, 3.0, 4.0])
+    report = evaluate_errors(MIRRORED, "plain", weights)
+    assert report.curve(torch.tensor([0.0, 0.05, 0.25, 0.5])).tolist() == pytest.approx([0.3, 0.7, 0.7, 0.8])
+    assert report.curve()[[40, 80, 200]].tolist() == pytest.approx(list(report.share_below.values()))
 
 
 def test_unknown_protocol_and_empty_group_are_named() -> None:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 __all__ = [
     "MESH_HELP",
     "METHODS",
+    "add_cache",
     "add_parameters",
     "as_plain",
     "fit_parameters",
@@ -57,6 +58,17 @@ _OPTIONS: tuple[tuple[str, str, Callable[[str], float], str], ...] = (
     ("--samples", "n_samples", int, "vertices that stand for the surface (default 2000)"),
     ("--seed", "seed", int, "of the samples; the same seed gives the same maps (default 0)"),
 )
+
+
+def add_cache(parser: argparse.ArgumentParser) -> None:
+    """The option ``--cache``."""
+    parser.add_argument(
+        "--cache",
+        type=Path,
+        metavar="DIR",
+        help="keep the eigenfunctions of the meshes here, and read them from here if they are there, as 'torchqm "
+        "prepare' puts them (default: the folder that TORCHQM_CACHE names, else nothing is kept)",
+    )
 
 
 def add_parameters(parser: argparse.ArgumentParser) -> None:

@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from torchqm.cli import demo, match, symmetry
+from torchqm.cli import data, demo, match, prepare, symmetry
 from torchqm.cli.console import UserError
 from torchqm.cli.threads import set_threads
 from torchqm.version import __version__
@@ -24,9 +24,12 @@ first steps:
   torchqm match cat3.off cat5.off --reference cat0.off
                                                 neither pose has a mirror plane, but cat0 has one
   torchqm symmetry cat3.off --reference cat0.off
+  torchqm data check FOLDER                     what a data set holds, and what is wrong with it
+  torchqm prepare FOLDER                        eigenfunctions of all its shapes, kept for later runs
 
-'torchqm COMMAND --help' explains a command. Exit status: 0 done, 2 wrong input (one line
-on stderr says which file and what is wrong with it; nothing is written), 130 interrupted."""
+'torchqm COMMAND --help' explains a command. Exit status: 0 done, 1 some shapes of a
+data set could not be used (the others were), 2 wrong input (one line on stderr says which
+file and what is wrong with it; nothing is written), 130 interrupted."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -40,7 +43,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"torchqm {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", dest="command", required=True)
-    for module in (demo, match, symmetry):
+    for module in (demo, match, symmetry, data, prepare):
         module.add_parser(commands)
     return parser
 
@@ -52,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: arguments after the program's name; by default those of the process.
 
     Returns:
-        0 if it was done, 2 if the input was at fault, 130 if it was interrupted.
+        0 if it was done, 2 if the input was at fault, 130 if it was interrupted; what else a command's help says.
 
     Raises:
         SystemExit: from argparse, with status 0 for ``--help`` and 2 for arguments it does not know.
@@ -60,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = build_parser().parse_args(argv)
     set_threads(arguments.threads, arguments.default_threads)
     try:
-        arguments.run(arguments)
+        status = arguments.run(arguments)
     except UserError as error:
         print(f"torchqm: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -70,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `torchqm match ... | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    return 0
+    return status or 0
 
 
 if __name__ == "__main__":

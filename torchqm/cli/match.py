@@ -9,6 +9,7 @@ from torchqm.cli.folder import staged_folder
 from torchqm.cli.inputs import (
     MESH_HELP,
     METHODS,
+    add_cache,
     add_parameters,
     as_plain,
     fit_parameters,
@@ -80,6 +81,7 @@ def add_parser(commands: Any) -> None:
         help="quotient (default): what measured best; paper: sections 4 to 7, its parameters; semi: section 5 alone",
     )
     parser.add_argument("--no-picture", action="store_true", help="do not draw match.png")
+    add_cache(parser)
     add_threads(parser)
     add_parameters(parser)
     parser.set_defaults(run=run)
@@ -118,6 +120,7 @@ def run(arguments: argparse.Namespace) -> None:
                 method=arguments.method,
                 parameters=parameters,
                 listener=progress.listener,
+                cache_dir=arguments.cache,
             )
         result.warnings[:0] = notes
         write_match(stage, result, source, target, progress, as_plain(arguments), not arguments.no_picture)

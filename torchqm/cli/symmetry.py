@@ -8,6 +8,7 @@ from torchqm.cli.console import Progress, format_table, print_seconds, print_war
 from torchqm.cli.folder import staged_folder
 from torchqm.cli.inputs import (
     MESH_HELP,
+    add_cache,
     add_parameters,
     as_plain,
     fit_parameters,
@@ -69,6 +70,7 @@ def add_parser(commands: Any) -> None:
         help="way of transfer. quotient (default): what measured best; paper: section 6.1",
     )
     parser.add_argument("--no-picture", action="store_true", help="do not draw symmetry.png")
+    add_cache(parser)
     add_threads(parser)
     add_parameters(parser)
     parser.set_defaults(run=run)
@@ -91,6 +93,7 @@ def run(arguments: argparse.Namespace) -> None:
                 reference=reference,
                 parameters=parameters,
                 listener=progress.listener,
+                cache_dir=arguments.cache,
                 method=arguments.method,
                 symmetry=arguments.symmetry,
             )

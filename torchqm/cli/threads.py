@@ -4,9 +4,10 @@ import argparse
 import os
 import sys
 
-__all__ = ["add_threads", "set_threads"]
+__all__ = ["THREAD_VARIABLES", "add_threads", "set_threads"]
 
-_NAMES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""What the numerical libraries read when they are loaded."""
 
 
 def add_threads(parser: argparse.ArgumentParser, default: int | None = None) -> None:
@@ -25,7 +26,7 @@ def set_threads(given: int | None, default: int | None) -> None:
     if "numpy" in sys.modules:  # called from Python: the caller decides
         return
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    for name in _NAMES:
+    for name in THREAD_VARIABLES:
         if given is not None:
             os.environ[name] = str(given)
         elif default is not None:

@@ -28,7 +28,7 @@ def cumulative_curve(
 
     Args:
         errors: ``(S,)`` errors; infinite ones are above every threshold.
-        thresholds: ``(N,)`` in the unit of the errors.
+        thresholds: ``(N,)`` in the unit of the errors; float64, where an error may equal one (0.1 is no float32).
         weights: ``(S,)`` nonnegative point weights, e.g. vertex areas; equal if left out.
 
     Returns:
@@ -43,9 +43,9 @@ def cumulative_curve(
     """
     errors, share = checked_errors(errors, weights)
     order = errors.argsort()
-    cumulated = torch.cat([torch.zeros(1, dtype=torch.float64), share[order].cumsum(0)])
+    cumulated = torch.cat([share.new_zeros(1), share[order].cumsum(0)])
     cumulated[-1] = 1.0  # not 1 - 1e-16
-    return cumulated[torch.searchsorted(errors[order], thresholds.to(torch.float64).contiguous(), right=True)]
+    return cumulated[torch.searchsorted(errors[order], thresholds.to(errors).contiguous(), right=True)]
 
 
 def area_under_curve(
@@ -89,7 +89,7 @@ def checked_errors(
         raise ValueError(f"errors: expected one or more errors >= 0, got {len(errors)} of which {bad} negative or NaN")
     if weights is None:
         return errors, torch.full_like(errors, 1 / len(errors))
-    weights = weights.detach().to(torch.float64)
+    weights = weights.detach().to(errors)
     total = float(weights.sum())
     if len(weights) != len(errors) or not bool((weights >= 0).all()) or not 0 < total < float("inf"):
         raise ValueError(

@@ -1,32 +1,30 @@
 """Geodesic error of a point-to-point map, from the distances of the true points only (never a V x V matrix).
 
 The error at source point x is ``d_N(T(x), T*(x)) / sqrt(area(N))``: geodesic distance on the target N between the
-predicted vertex and the true one. Only the rows of the true points are computed. They are kept in
+predicted vertex and the true one. Only the rows of the true points are computed. Those of chosen points are kept in
 :class:`TruthDistances`, built once for a target and shared by all maps, pairs and protocols that use the same true
-points, and optionally on disk.
+points, and optionally on disk. Where the truth is all vertices of a large shape, :func:`geodesic_errors` keeps no rows.
 
 References:
     Kim, Lipman, Funkhouser 2011, section 7 (the error and its scale); Ovsjanikov et al. 2013, section 7.
 """
 
-import hashlib
-import warnings
-import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchqm.geometry.files import write_whole
+from torchqm.evaluate.distances import distance_rows, pair_distances
 from torchqm.geometry.mesh import Mesh
 
 __all__ = ["SurfacePoints", "TruthDistances", "geodesic_errors", "group_truth", "spread_points"]
 
-_CACHE_VERSION = 1
-_CHUNK_BYTES = 2**28  # of the solver's float64 rows at a time (it sets up anew for each chunk); kept are float32
+MAX_ROWS_BYTES = 2**29
+"""Rows that :class:`TruthDistances` keeps at most: 2,550 of 52,565 vertices, or all of 11,500."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +73,9 @@ class TruthDistances:
     """Rows of geodesic distances on a target from its true points, and the scale of the error.
 
     Memory: ``4 U V`` bytes for U different true vertices (float32; a relative error of 6e-8 is far below the solver's).
-    A reflection and 100 points on 53k vertices are 42 MB.
+    A reflection and 1,024 points on 53k vertices are 430 MB. Where a matrix of all distances is at hand, as in the data
+    sets of the learned methods, ``TruthDistances(mesh, torch.arange(mesh.n_verts), dist, mesh.area**0.5, "given")``
+    takes it as it is.
 
     Args:
         mesh: the target.
@@ -83,7 +83,8 @@ class TruthDistances:
         rows: ``(U, V)`` distance of every vertex from each source, in the unit of ``mesh.verts``; infinite between
             components.
         sqrt_area: square root of the target's total area.
-        method: the solver, see :func:`torchqm.geometry.geodesic.distances`; name it beside every number.
+        method: the solver that computed them (``heat`` where fast marching was asked for and cannot run); name it
+            beside every number.
     """
 
     mesh: Mesh
@@ -91,6 +92,11 @@ class TruthDistances:
     rows: Float[Tensor, "U V"]
     sqrt_area: float
     method: str
+
+    @staticmethod
+    def fits(mesh: Mesh, truth: Int[Tensor, "..."] | SurfacePoints) -> bool:
+        """Whether the rows of these true points take at most :data:`MAX_ROWS_BYTES`."""
+        return 4 * len(_vertex_ids(truth).unique()) * mesh.n_verts <= MAX_ROWS_BYTES
 
     @classmethod
     def build(
@@ -106,23 +112,21 @@ class TruthDistances:
             mesh: the target.
             truth: vertex ids of any shape, e.g. ``(S,)`` or ``(G, S)``, or points inside faces.
             method: geodesic solver.
-            cache_dir: folder for ``.npz`` files keyed by the content of mesh, sources and method. Entries are written
-                beside and renamed, so many processes may share it; a damaged entry is computed anew with a warning.
+            cache_dir: folder for the rows, see :func:`torchqm.evaluate.distances.distance_rows`.
 
         Raises:
-            ValueError: if a vertex id is out of range, there is no true point, or the mesh has no area.
+            ValueError: if a vertex id is out of range, there is no true point, the mesh has no area, or the rows would
+                take more than :data:`MAX_ROWS_BYTES`.
         """
-        sources = _vertex_ids(truth).unique()
-        _check_ids("truth", sources, mesh)
-        if not (mesh.area > 0 and np.isfinite(mesh.area)):
-            raise ValueError(f"mesh: {mesh.label} has area {mesh.area}; the error is undefined")
-        path = None if cache_dir is None else Path(cache_dir) / f"{_cache_key(mesh, sources, method)}.npz"
-        rows = None if path is None else _read_rows(path, sources, mesh.n_verts)
-        if rows is None:
-            rows = _compute_rows(mesh, sources, method)
-            if path is not None:
-                _write_rows(path, sources, rows)
-        return cls(mesh, sources, rows, mesh.area**0.5, method)
+        sources, sqrt_area = _true_sources(mesh, truth)
+        if not cls.fits(mesh, sources):
+            raise ValueError(
+                f"truth: rows of {len(sources)} true vertices of {mesh.label} take "
+                f"{4 * len(sources) * mesh.n_verts / 2**30:.1f} GiB, allowed are {MAX_ROWS_BYTES / 2**30:.1f}; measure "
+                "at spread_points(mesh), or call geodesic_errors, which keeps no rows"
+            )
+        rows, solver = distance_rows(mesh, sources, method, cache_dir)
+        return cls(mesh, sources, rows, sqrt_area, solver)
 
     def errors(self, predicted: Int[Tensor, " S"], truth: Int[Tensor, "..."] | SurfacePoints) -> Float[Tensor, "..."]:
         """Geodesic distance / sqrt(area) between predicted vertices and true points.
@@ -142,23 +146,7 @@ class TruthDistances:
         Raises:
             ValueError: if an id is out of range, lengths differ or a true vertex has no row here.
         """
-        _check_ids("predicted", predicted, self.mesh)
-        shape = truth.corners.shape[:-1] if isinstance(truth, SurfacePoints) else truth.shape
-        if len(shape) == 0 or shape[-1] != len(predicted):
-            raise ValueError(
-                f"truth: expected a true point for each of the {len(predicted)} predictions, got shape {tuple(shape)}"
-            )
-        if isinstance(truth, SurfacePoints):
-            to_corners = self._lookup(truth.corners, predicted[:, None])
-            corners, bary = self.mesh.verts[truth.corners], truth.bary.to(torch.float64)
-            points = (bary[..., None] * corners).sum(-2)
-            detour = (to_corners + (corners - points[..., None, :]).norm(dim=-1)).min(-1).values
-            # a corner of weight 0 must not make 0 * inf
-            interpolated = torch.where(bary > 0, bary * to_corners, torch.zeros_like(bary)).sum(-1)
-            out = torch.minimum(interpolated, detour)
-        else:
-            out = self._lookup(truth, predicted)
-        return out / self.sqrt_area
+        return _errors(self.mesh, predicted, truth, self._lookup) / self.sqrt_area
 
     def _lookup(self, truth: Int[Tensor, "..."], predicted: Int[Tensor, "..."]) -> Float[Tensor, "..."]:
         position = torch.searchsorted(self.sources, truth.contiguous()).clamp_max(len(self.sources) - 1)
@@ -182,6 +170,11 @@ def geodesic_errors(
 ) -> Float[Tensor, "..."]:
     """Geodesic errors of a point-to-point map at some source points, divided by sqrt(area of the target).
 
+    Rows of distances are kept while they are computed if they take at most :data:`MAX_ROWS_BYTES`. Beyond that, as with
+    a truth at all vertices of a large shape, a chunk of rows is computed, read and forgotten: 52k vertices stay below
+    2 GiB (``benchmarks/evaluate_memory.py``). That takes a solve for every true vertex: on 53k vertices and a slow core
+    ten minutes with ``dijkstra``, twenty with ``heat``, ninety with ``fast_marching``.
+
     Args:
         target_mesh: the target.
         p2p: ``(Vs,)`` target vertex of each source vertex (source to target).
@@ -190,7 +183,7 @@ def geodesic_errors(
         at: ``(S,)`` source vertices at which to measure; all of them if left out.
         method: geodesic solver; ignored if ``distances`` is given.
         distances: rows built before for this target; they must contain all true points.
-        cache_dir: see :meth:`TruthDistances.build`.
+        cache_dir: folder for rows, or where none are kept for the distances that were read from them.
 
     Returns:
         ``(S,)`` or ``(G, S)`` float64 errors, ready for :func:`torchqm.evaluate.protocol.evaluate_errors`.
@@ -207,29 +200,44 @@ def geodesic_errors(
     if len(at) and not 0 <= int(at.min()) <= int(at.max()) < len(p2p):
         raise ValueError(f"at: source vertices must lie in 0..{len(p2p) - 1}, got {int(at.min())}..{int(at.max())}")
     if distances is None:
+        sources, sqrt_area = _true_sources(target_mesh, truth)
+        if not TruthDistances.fits(target_mesh, sources):
+            return _errors(target_mesh, p2p[at], truth, _streamed(target_mesh, method, cache_dir)) / sqrt_area
         distances = TruthDistances.build(target_mesh, truth, method, cache_dir)
     elif distances.mesh is not target_mesh and not _same_mesh(distances.mesh, target_mesh):
         raise ValueError(f"distances: built for {distances.mesh.label}, not for {target_mesh.label}")
     return distances.errors(p2p[at], truth)
 
 
-def group_truth(truth: Int[Tensor, " S"], maps: Int[Tensor, "G V"]) -> Int[Tensor, "G S"]:
+def group_truth(
+    truth: Int[Tensor, " S"] | SurfacePoints, maps: Int[Tensor, "G V"]
+) -> Int[Tensor, "G S"] | SurfacePoints:
     """Images of the true points under the target's symmetry group: all answers that are equally right.
 
     Args:
-        truth: ``(S,)`` true target vertices.
+        truth: ``(S,)`` true target vertices, or S points inside faces, which go where their corners go (exact where the
+            image of a face is a face again).
         maps: ``(G, V)`` vertex maps of the target, row 0 the identity (``SymmetryGroup.maps``). On TOSCA they come
             from the undeformed pose of the class, whose vertex ids all poses share.
+
+    Returns:
+        ``(G, S)`` vertices or points, row 0 the truth itself.
+
+    Raises:
+        ValueError: if a vertex is out of range or row 0 is not the identity.
 
     Example:
         >>> group_truth(torch.tensor([0, 2]), torch.tensor([[0, 1, 2], [2, 1, 0]])).tolist()
         [[0, 2], [2, 0]]
     """
-    n_verts = maps.shape[1]
-    if len(truth) and not 0 <= int(truth.min()) <= int(truth.max()) < n_verts:
-        raise ValueError(f"truth: vertices must lie in 0..{n_verts - 1}, got {int(truth.min())}..{int(truth.max())}")
-    if not torch.equal(maps[0], torch.arange(n_verts)):
+    ids, n_verts = _vertex_ids(truth), maps.shape[1]
+    if len(ids) and not 0 <= int(ids.min()) <= int(ids.max()) < n_verts:
+        raise ValueError(f"truth: vertices must lie in 0..{n_verts - 1}, got {int(ids.min())}..{int(ids.max())}")
+    if len(maps) == 0 or not torch.equal(maps[0], torch.arange(n_verts)):
         raise ValueError("maps: row 0 must be the identity")
+    if isinstance(truth, SurfacePoints):
+        corners = maps[:, truth.corners]
+        return SurfacePoints(corners, truth.bary.expand(corners.shape))
     return maps[:, truth]
 
 
@@ -260,39 +268,42 @@ def _same_mesh(a: Mesh, b: Mesh) -> bool:
     return torch.equal(a.verts, b.verts) and torch.equal(a.faces, b.faces)
 
 
-def _compute_rows(mesh: Mesh, sources: Int[Tensor, " U"], method: str) -> Float[Tensor, "U V"]:
-    from torchqm.geometry.geodesic import distances  # on first use: it loads the solvers
-
-    rows = torch.empty(len(sources), mesh.n_verts, dtype=torch.float32)
-    step = max(1, _CHUNK_BYTES // (8 * mesh.n_verts))
-    for first in range(0, len(sources), step):
-        rows[first : first + step] = distances(mesh, sources[first : first + step], method=method).to(torch.float32)
-    return rows
-
-
-def _cache_key(mesh: Mesh, sources: Int[Tensor, " U"], method: str) -> str:
-    digest = hashlib.sha256(f"torchqm truth distances {_CACHE_VERSION} {method} {mesh.n_verts} {mesh.n_faces}".encode())
-    for array in (*mesh.numpy(), sources.numpy()):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()[:40]
+def _true_sources(mesh: Mesh, truth: Int[Tensor, "..."] | SurfacePoints) -> tuple[Int[Tensor, " U"], float]:
+    """The different true vertices in ascending order, and the scale of the error; ValueError where there is none."""
+    sources = _vertex_ids(truth).unique()
+    _check_ids("truth", sources, mesh)
+    if not (mesh.area > 0 and isfinite(mesh.area)):
+        raise ValueError(f"mesh: {mesh.label} has area {mesh.area}; the error is undefined")
+    return sources, mesh.area**0.5
 
 
-def _read_rows(path: Path, sources: Int[Tensor, " U"], n_verts: int) -> Float[Tensor, "U V"] | None:
-    """The cached rows, or None if there are none or they are not what was asked for."""
-    if not path.exists():
-        return None
-    try:
-        with np.load(path, allow_pickle=False) as entry:
-            rows, ids = entry["rows"], entry["sources"]
-        if rows.shape == (len(sources), n_verts) and rows.dtype == np.float32 and np.array_equal(ids, sources.numpy()):
-            return torch.from_numpy(rows)
-        reason = f"it holds {rows.dtype} {rows.shape}"
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile) as error:
-        reason = str(error)
-    warnings.warn(f"{path}: damaged or foreign cache entry, computed anew ({reason})", stacklevel=3)
-    return None
+_Lookup = Callable[[Tensor, Tensor], Tensor]  # true vertices (...), predicted vertices (broadcast) -> distances (...)
 
 
-def _write_rows(path: Path, sources: Int[Tensor, " U"], rows: Float[Tensor, "U V"]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, lambda file: np.savez(file, rows=rows.numpy(), sources=sources.numpy()))
+def _streamed(mesh: Mesh, method: str, cache_dir: str | Path | None) -> _Lookup:
+    def lookup(truth: Tensor, predicted: Tensor) -> Tensor:
+        pairs = truth.reshape(-1), predicted.expand(truth.shape).reshape(-1)
+        return pair_distances(mesh, *pairs, method, cache_dir).reshape(truth.shape)
+
+    return lookup
+
+
+def _errors(
+    mesh: Mesh, predicted: Int[Tensor, " S"], truth: Int[Tensor, "..."] | SurfacePoints, lookup: _Lookup
+) -> Float[Tensor, "..."]:
+    """Distances from true points to predicted vertices, in the unit of the mesh."""
+    _check_ids("predicted", predicted, mesh)
+    shape = truth.corners.shape[:-1] if isinstance(truth, SurfacePoints) else truth.shape
+    if len(shape) == 0 or shape[-1] != len(predicted):
+        raise ValueError(
+            f"truth: expected a true point for each of the {len(predicted)} predictions, got shape {tuple(shape)}"
+        )
+    if not isinstance(truth, SurfacePoints):
+        return lookup(truth, predicted)
+    to_corners = lookup(truth.corners, predicted[:, None])
+    corners, bary = mesh.verts[truth.corners], truth.bary.to(torch.float64)
+    points = (bary[..., None] * corners).sum(-2)
+    detour = (to_corners + (corners - points[..., None, :]).norm(dim=-1)).min(-1).values
+    # a corner of weight 0 must not make 0 * inf
+    interpolated = torch.where(bary > 0, bary * to_corners, torch.zeros_like(bary)).sum(-1)
+    return torch.minimum(interpolated, detour)

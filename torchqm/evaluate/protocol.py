@@ -5,14 +5,13 @@ true map, row 0 being the plain (direct) truth and the other rows its images und
 (:func:`torchqm.evaluate.metrics.group_truth`).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchqm.evaluate.curves import area_under_curve, checked_errors, cumulative_curve
+from torchqm.evaluate.curves import area_under_curve, checked_errors, cumulative_curve, curve_thresholds
 
 __all__ = [
     "PROTOCOLS",
@@ -20,11 +19,9 @@ __all__ = [
     "ErrorReport",
     "FlipRate",
     "Protocol",
-    "Summary",
     "evaluate_errors",
     "flip_rate",
     "make_report",
-    "summarize",
 ]
 
 SHARES = (0.05, 0.1, 0.25)
@@ -80,6 +77,8 @@ class ErrorReport:
         n_points: S.
         element: which row of the error matrix counted (``map``: the best one); None where it differs from point to
             point.
+        solver: the geodesic solver behind the errors (:attr:`TruthDistances.method`); None where nobody said.
+        weights: ``(S,)`` the point weights behind the numbers; None if equal.
     """
 
     protocol: str
@@ -90,6 +89,29 @@ class ErrorReport:
     share_below: dict[float, float]
     n_points: int
     element: int | None
+    solver: str | None = None
+    weights: Float[Tensor, " S"] | None = None
+
+    def curve(self, thresholds: Float[Tensor, " N"] | None = None) -> Float[Tensor, " N"]:
+        """The cumulative curve at thresholds, those of :func:`~torchqm.evaluate.curves.curve_thresholds` if not given.
+
+        Example:
+            >>> make_report("plain", torch.tensor([0.0, 0.2])).curve(torch.tensor([0.1, 0.2])).tolist()
+            [0.5, 1.0]
+        """
+        thresholds = curve_thresholds() if thresholds is None else thresholds
+        return cumulative_curve(self.errors, thresholds, self.weights)
+
+    def to_row(self) -> dict[str, float | int | None]:
+        """The numbers as columns of a table of pairs: ``plain_mean``, ``plain_median``, ``plain_below_0.05``, ...
+
+        Example:
+            >>> list(make_report("map", torch.tensor([0.0])).to_row())[:3]
+            ['map_mean', 'map_median', 'map_auc']
+        """
+        numbers = {"mean": self.mean, "median": self.median, "auc": self.auc}
+        numbers |= {f"below_{threshold}": share for threshold, share in self.share_below.items()}
+        return {f"{self.protocol}_{key}": value for key, value in numbers.items()}
 
     def to_dict(self) -> dict[str, object]:
         """The numbers without the per-point errors, ready for JSON (thresholds become strings)."""
@@ -101,6 +123,7 @@ class ErrorReport:
             "share_below": {str(threshold): share for threshold, share in self.share_below.items()},
             "n_points": self.n_points,
             "element": self.element,
+            "solver": self.solver,
         }
 
 
@@ -121,35 +144,11 @@ class FlipRate:
     patches: float
 
 
-@dataclass(frozen=True)
-class Summary:
-    """Means over pairs of the per-pair numbers; every pair counts once, however many points it has.
-
-    Args:
-        protocol: the one protocol of all reports.
-        n_pairs: number of pairs behind the means; print it with them.
-        mean, median, auc, share_below: means of the reports' numbers.
-        worst: the largest per-pair mean.
-    """
-
-    protocol: str
-    n_pairs: int
-    mean: float
-    median: float
-    auc: float
-    share_below: dict[float, float]
-    worst: float
-
-    def to_dict(self) -> dict[str, object]:
-        """The numbers, ready for JSON (thresholds become strings)."""
-        return {
-            **self.__dict__,
-            "share_below": {str(threshold): share for threshold, share in self.share_below.items()},
-        }
-
-
 def evaluate_errors(
-    errors: Float[Tensor, "G S"], protocol: str | Protocol = "map", weights: Float[Tensor, " S"] | None = None
+    errors: Float[Tensor, "G S"],
+    protocol: str | Protocol = "map",
+    weights: Float[Tensor, " S"] | None = None,
+    solver: str | None = None,
 ) -> ErrorReport:
     """Apply a protocol to the errors of one map.
 
@@ -157,6 +156,7 @@ def evaluate_errors(
         errors: ``(G, S)`` errors against the G true maps, row 0 the plain truth.
         protocol: a :class:`Protocol` or its name.
         weights: ``(S,)`` point weights, e.g. the vertex areas of the source at the points; equal if left out.
+        solver: what computed the distances, to be named in the result.
 
     Raises:
         ValueError: if the protocol is unknown, or the errors or weights are unusable (NaN, negative, none).
@@ -170,13 +170,17 @@ def evaluate_errors(
     if errors.shape[0] == 0:
         raise ValueError("errors: expected a row for each true map, got none")
     if protocol.forgives == "point":
-        return make_report(protocol.name, errors.min(0).values, weights, None)
+        return make_report(protocol.name, errors.min(0).values, weights, None, solver)
     element = int(_means(errors, weights).argmin()) if protocol.forgives == "map" else 0
-    return make_report(protocol.name, errors[element], weights, element)
+    return make_report(protocol.name, errors[element], weights, element, solver)
 
 
 def make_report(
-    protocol: str, errors: Float[Tensor, " S"], weights: Float[Tensor, " S"] | None = None, element: int | None = None
+    protocol: str,
+    errors: Float[Tensor, " S"],
+    weights: Float[Tensor, " S"] | None = None,
+    element: int | None = None,
+    solver: str | None = None,
 ) -> ErrorReport:
     """Report of errors that are already one a point, e.g. published ones."""
     values, share = checked_errors(errors, weights)
@@ -193,6 +197,8 @@ def make_report(
         share_below=dict(zip(SHARES, curve.tolist(), strict=True)),
         n_points=len(values),
         element=element,
+        solver=solver,
+        weights=weights,
     )
 
 
@@ -225,35 +231,6 @@ def flip_rate(
         return float(share[nearest < errors[row].to(torch.float64) - margin].sum())
 
     return FlipRate(points=nearer_elsewhere(0), map=bool(means[best] < means[0]), patches=nearer_elsewhere(best))
-
-
-def summarize(reports: Sequence[ErrorReport]) -> Summary:
-    """Means over pairs of per-pair numbers.
-
-    Raises:
-        ValueError: if there are no reports or they mix protocols.
-
-    Example:
-        >>> a, b = make_report("plain", torch.tensor([0.0, 0.2])), make_report("plain", torch.tensor([0.3]))
-        >>> summary = summarize([a, b])
-        >>> summary.n_pairs, round(summary.mean, 3)
-        (2, 0.2)
-    """
-    names = sorted({report.protocol for report in reports})
-    if len(names) != 1:
-        raise ValueError(
-            f"reports: expected one or more reports of one protocol, got {len(reports)} of {names or 'none'}"
-        )
-    count = len(reports)
-    return Summary(
-        protocol=names[0],
-        n_pairs=count,
-        mean=sum(report.mean for report in reports) / count,
-        median=sum(report.median for report in reports) / count,
-        auc=sum(report.auc for report in reports) / count,
-        share_below={t: sum(report.share_below[t] for report in reports) / count for t in SHARES},
-        worst=max(report.mean for report in reports),
-    )
 
 
 def _protocol(protocol: str | Protocol) -> Protocol:
