@@ -12,6 +12,7 @@ from torchqm.matching.self_map import (
     reflection_score,
     self_map_from_halves,
     self_maps_from_halves,
+    settled_self_map,
 )
 
 
@@ -132,3 +133,22 @@ def test_nearest_involution():
     for seed in range(1, 30):
         other = nearest_involution(found + 0.5 * noise(6, 6, seed=seed))
         assert (matrix - found).norm() <= (matrix - other).norm() + 1e-12
+
+
+@pytest.mark.parametrize("involution", [True, False])
+def test_settling_mends_a_noisy_map_and_keeps_an_exact_one(exact, involution):
+    wanted, k = true_map(exact), min(K, 60)
+    start = nearest_involution(true_map(exact) + 0.03 * noise(K, K))
+    parameters = FAST.changed(n_samples=642)
+    for begun in (wanted, start):
+        found = settled_self_map(begun, exact.x, parameters, involution, start=30)
+        torch.testing.assert_close(found[:k, :k], wanted[:k, :k], atol=1e-2, rtol=0)
+    if involution:
+        torch.testing.assert_close(found, found.T, atol=1e-10, rtol=0)
+    torch.testing.assert_close(found @ found.T, identity(K), atol=1e-8, rtol=0)
+
+
+def test_features_alone_do_not_turn_left_to_right(exact):
+    """They are the same at both: from the identity, the identity comes back, not the reflection."""
+    found = settled_self_map(identity(K), exact.x, FAST.changed(n_samples=642), False, start=30)
+    torch.testing.assert_close(found, identity(K), atol=1e-2, rtol=0)
