@@ -66,14 +66,14 @@ def assemble(pool: Sequence[Proposal], judge: Judge, parameters: MatchParameters
         judge: of the shape.
         parameters: of the refinement.
     """
-    limit = min(LIMIT, max(0.03, 3.5 * pool[0].score))
+    limit = min(LIMIT, max(0.03, 3.5 * min(p.score for p in pool)))
     one = torch.eye(pool[0].fmap.shape[0], dtype=pool[0].fmap.dtype)
     group = FunctionalGroup((Proposal(one, 1, True, 0.0),), torch.zeros(1, 1, dtype=torch.int64))
     refused = 0
     for new in pool:
         first = group.order == 1
         if not first and new.score > limit:
-            break
+            continue  # the pool is not in the order of scores alone
         if any(correlation(new.fmap, g.fmap) > ALIKE for g in group.elements):
             continue
         larger = _closed([*group.elements, new], pool, judge, parameters, max(limit, pool[0].score))

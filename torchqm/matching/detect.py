@@ -14,7 +14,7 @@ from torchqm.matching.assemble import ALIKE, FunctionalGroup, assemble
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.parity import odd_halves
 from torchqm.matching.proposals import Judge, Proposal, correlation, propose
-from torchqm.matching.quality import commutativity_score, orientation_agreement
+from torchqm.matching.quality import commutativity_score, map_label, orientation_agreement
 from torchqm.matching.self_map import grow_self_map, settled_self_map
 from torchqm.matching.shape import N_ANCHORS, PreparedShape
 from torchqm.symmetry.algebra import group_name
@@ -46,7 +46,8 @@ class Detection:
         products: ``(G, G)`` which element is nearest to g after h.
         name: of the group, such as ``C2`` or ``D8`` (order 16).
         verdict: ``symmetric``, ``ambiguous`` or ``asymmetric``.
-        parts: the numbers behind it. ``score`` (of the best candidate at 100 functions), ``runner_up`` (of the best
+        parts: the numbers behind it, of maps before local features settled them
+            (:func:`torchqm.matching.self_map.settled_self_map`). ``score`` (of the best candidate at 100 functions), ``runner_up`` (of the best
             candidate that is no element of the group), ``margin`` (their ratio), ``refused`` (how many good maps did
             not fit into the group). Of the best vertex map:
             ``commutativity`` (150 functions; with ``score`` it decides by :data:`SYMMETRIC` and :data:`ASYMMETRIC`),
@@ -95,14 +96,12 @@ def detect_group(x: PreparedShape, parameters: MatchParameters | None = None) ->
         judge = Judge(x)
         pool = propose(judge, parameters)
         found = assemble(pool, judge, parameters)
-    return _judged(x, pool, found, parameters)
+    return _judged(judge, pool, found, parameters)
 
 
-def _judged(
-    x: PreparedShape, pool: Sequence[Proposal], found: FunctionalGroup, parameters: MatchParameters
-) -> Detection:
+def _judged(judge: Judge, pool: Sequence[Proposal], found: FunctionalGroup, parameters: MatchParameters) -> Detection:
     """Refine the elements, make them vertex maps and measure the best one."""
-    elements = found.elements[1:] or pool[:1]
+    x, elements = judge.x, found.elements[1:] or pool[:1]
     fmaps, maps = [], []
     # The elements of a large group were averaged over all products already, and there are many of them.
     few = parameters if len(elements) == 1 else parameters.changed(n_samples=min(1000, parameters.n_samples))
@@ -121,13 +120,24 @@ def _judged(
     orientation = torch.tensor([1.0, *(float(e.orientation) for e in elements)], dtype=torch.float64)
     agreement = [orientation_agreement(x.mesh, x.mesh, m) if x.oriented else 0.0 for m in maps]
     parts["orientation"] = agreement[0]
-    turned = not x.oriented or agreement[0] * elements[0].orientation > 0.3
+    # Small triangles are turned over by the errors of a right map; smooth functions are not.
+    label = map_label(agreement[0], judge.orientation(fmaps[0])) if x.oriented else ""
+    turned = not x.oriented or label == ("direct" if elements[0].orientation > 0 else "mirrored")
     numbers, name = _text(parts), x.mesh.label
     verdict, warnings = "symmetric", []
-    refused = parts["score"] > ASYMMETRIC[0] or parts["commutativity"] > ASYMMETRIC[1]
-    if refused or found.order == 1 or parts["moved"] < 0.5 or not turned:
+    faults = [
+        text
+        for fault, text in (
+            (parts["score"] > ASYMMETRIC[0] or parts["commutativity"] > ASYMMETRIC[1], "is far from an isometry"),
+            (found.order == 1, "makes no group, its powers are no good maps"),
+            (parts["moved"] < 0.5, "leaves half of the shape where it is"),
+            (not turned, "keeps the orientation here and turns it over there"),
+        )
+        if fault
+    ]
+    if faults:
         verdict = "asymmetric"
-        warnings.append(f"{name}: no symmetry was found: the best map is far from an isometry ({numbers})")
+        warnings.append(f"{name}: no symmetry was found: the best map {' and '.join(faults)} ({numbers})")
     elif parts["score"] > SYMMETRIC[0] or parts["commutativity"] > SYMMETRIC[1] or parts["moved"] < 0.7:
         verdict = "ambiguous"
         warnings.append(f"{name}: the symmetry found may be wrong in parts ({numbers})")

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchqm.fmap.solve import solve_fmap
 from torchqm.matching.parameters import MatchParameters
+from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.basis import SpectralBasis, cluster_end
 from torchqm.spectral.descriptors import (
     heat_kernel_signature,
@@ -18,7 +19,13 @@ from torchqm.spectral.descriptors import (
     wave_kernel_signature,
 )
 
-__all__ = ["basis_size", "initial_fmap", "shared_descriptors"]
+__all__ = ["basis_size", "curvature_descriptors", "initial_fmap", "shared_descriptors"]
+
+SHARPEST = 30.0
+"""Curvature above which it is not told how much more: 1/30 of sqrt(area) is the radius of a finger."""
+
+N_CURVATURES = 20
+"""Intervals of curvature."""
 
 
 def basis_size(bases: Sequence[SpectralBasis], k: int) -> int:
@@ -48,12 +55,26 @@ def shared_descriptors(bases: Sequence[SpectralBasis], parameters: MatchParamete
     return split_descriptors(values, parameters.splits)
 
 
+def curvature_descriptors(x: PreparedShape, y: PreparedShape) -> list[Float[Tensor, "_V C"]]:
+    """Smooth mean curvature and its splitting, less the mean: what tells front from back.
+
+    Intrinsic signatures hardly know the face of a person from the back of the head, and least squares may turn the body
+    round; curvature knows, and is the same left and right.
+    """
+    bends = [s.curvature if x.oriented and y.oriented else s.curvature.abs() for s in (x, y)]
+    bends = [b.clamp(-SHARPEST, SHARPEST)[:, None] for b in bends]
+    values = [torch.cat([b, s], 1) for b, s in zip(bends, split_descriptors(bends, N_CURVATURES), strict=True)]
+    return [v - (s.basis.mass @ v) / s.basis.mass.sum() for v, s in zip(values, (x, y), strict=True)]
+
+
 def initial_fmap(
     basis_x: SpectralBasis,
     basis_y: SpectralBasis,
     values_x: Float[Tensor, "Vx C"],
     values_y: Float[Tensor, "Vy C"],
     commutativity: float,
+    more: Sequence[Float[Tensor, "_V D"]] | None = None,
+    weight: float = 0.5,
 ) -> Float[Tensor, "Ky Kx"]:
     """Least-squares map from descriptor preservation and commutativity, between any two bases of the two shapes.
 
@@ -63,11 +84,18 @@ def initial_fmap(
         values_x: ``(Vx, C)`` descriptors of the source.
         values_y: ``(Vy, C)`` the same of the target.
         commutativity: weight of the commutativity term per (descriptor / basis function).
+        more: ``(Vx, D)`` and ``(Vy, D)`` descriptors of another kind.
+        weight: of all of these together, where the others together have 1.
     """
     coeffs_x, coeffs_y = unit_columns_pair(basis_x.coefficients(values_x), basis_y.coefficients(values_y))
-    weight = commutativity * coeffs_x.shape[1] / basis_x.k
+    total = float(coeffs_x.shape[1])
+    if more is not None:
+        more_x, more_y = unit_columns_pair(basis_x.coefficients(more[0]), basis_y.coefficients(more[1]))
+        scale = weight * (total / more_x.shape[1]) ** 0.5
+        coeffs_x, coeffs_y = torch.cat([coeffs_x, scale * more_x], 1), torch.cat([coeffs_y, scale * more_y], 1)
+        total *= 1 + weight**2
     # Exactly symmetric twins have odd functions without descriptors at equal frequencies: nothing is known of these.
-    return solve_fmap(coeffs_x, coeffs_y, basis_x.evals, basis_y.evals, weight, ridge=1e-9)
+    return solve_fmap(coeffs_x, coeffs_y, basis_x.evals, basis_y.evals, commutativity * total / basis_x.k, ridge=1e-9)
 
 
 def unit_columns_pair(

@@ -17,7 +17,7 @@ from torchqm.matching.parity import odd_halves
 from torchqm.matching.quality import orientation_agreement
 from torchqm.matching.self_map import nearest_involution
 from torchqm.matching.shape import PreparedShape
-from torchqm.matching.symmetry_file import closure_fault, reflection_fault, return_error
+from torchqm.matching.symmetry_file import MAX_RETURN_ERROR, closure_fault, reflection_fault, return_error
 from torchqm.matching.transfer import transfer_symmetry
 from torchqm.symmetry.algebra import group_name
 from torchqm.symmetry.extrinsic import ExtrinsicReflection, extrinsic_group, find_reflections
@@ -240,7 +240,8 @@ def given_symmetry(shape: PreparedShape, maps: Tensor, origin: str = "file") -> 
     none = torch.zeros_like(shape.basis.mass)
     if group.order == 1:
         return KnownSymmetry(group, none, origin)
-    if group.order > 2:
+    rotation = shape.oriented and orientation_agreement(shape.mesh, shape.mesh, group.maps[1]) > 0.3
+    if group.order > 2 or (rotation and return_error(shape.mesh, group.maps[1]) <= MAX_RETURN_ERROR):
         return _given_group(shape, group, origin)
     reflection = group.maps[1]
     fault = reflection_fault(shape.mesh, reflection)
@@ -251,7 +252,7 @@ def given_symmetry(shape: PreparedShape, maps: Tensor, origin: str = "file") -> 
 
 
 def _given_group(shape: PreparedShape, group: SymmetryGroup, origin: str) -> KnownSymmetry:
-    """A table of more than two maps, if it is closed under composition."""
+    """A table of more than two maps, or of the identity and a half turn, if it is closed under composition."""
     fault, residuals = closure_fault(shape.mesh, group)
     if fault is not None:
         raise MatchError(f"{shape.mesh.label}: the {group.order} maps of the symmetry are no group: {fault}")

@@ -10,7 +10,7 @@ from torchqm.fmap.refine import nearest_isometry
 from torchqm.fmap.solve import solve_fmap
 from torchqm.matching.initial import basis_size
 from torchqm.matching.known import KnownSymmetry
-from torchqm.matching.parameters import MatchParameters
+from torchqm.matching.parameters import MatchError, MatchParameters
 from torchqm.matching.quotient import QuotientMatch
 from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.basis import SpectralBasis
@@ -74,6 +74,7 @@ def full_map_from_orbits(
 
     Raises:
         ValueError: the groups have different orders.
+        MatchError: no sample has as many different images as the groups have elements.
 
     References:
         Paper, section 4.4: of the orbit of ``T(x)`` the point in the fundamental domain that belongs to x's.
@@ -90,6 +91,11 @@ def full_map_from_orbits(
     # The centre of a domain must be far from its own images, and so must the point that it goes to.
     room = torch.minimum(_separation(points_x, known_x.group.orbits[samples]), _separation(points_y, orbits.T))
     found: list[OrbitMatch] = []
+    if float(room.max()) <= 0:
+        raise MatchError(
+            f"{x.mesh.label} -> {y.mesh.label}: of the samples none has {known_x.group.order} different images under "
+            "both groups, so none can be the centre of a fundamental domain; the meshes are too coarse for the group"
+        )
     for number in _spread(points_x[samples], room, n_starts):
         start, goal = int(samples[number]), int(orbit_map[samples[number]])
         domains_x = fundamental_domains(known_x.group, points_x, x.basis.mass, start, known_x.products)
@@ -123,7 +129,7 @@ def _spread(places: Float[Tensor, "S D"], room: Float[Tensor, " S"], n: int) -> 
     """Up to n samples with much room, not close to each other: each is best in room times distance to those before."""
     chosen = [int(room.argmax())]
     distance = (places - places[chosen[0]]).norm(dim=1)
-    while len(chosen) < min(n, len(room)):
+    while len(chosen) < min(n, int((room > 0).sum())):
         chosen.append(int((room * distance).argmax()))
         distance = torch.minimum(distance, (places - places[chosen[-1]]).norm(dim=1))
     return chosen

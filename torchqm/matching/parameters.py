@@ -33,8 +33,9 @@ class MatchParameters:
         n_samples: vertices, drawn by area, that stand for the surface.
         semi_width: width of the frequency mask in semi-quotient ICP; None is the iteration as printed.
         refinement: ``icp`` (the paper: ICP at k = 100 and 300), ``upsample`` (growing basis, both ways) or ``none``.
-        local_weight: of local features against spectral coordinates in two-way upsampling
-            (:func:`torchqm.fmap.two_way.two_way_upsample`).
+        local_weight: of local features against spectral coordinates in two-way upsampling between shapes
+            (:func:`torchqm.fmap.two_way.two_way_upsample`); 0 leaves them out, also of self-maps, where they have half
+            the default weight, and of the first least-squares map, where curvature is a descriptor.
         growth: ratio by which the basis grows from one step of upsampling to the next.
         seed: of the samples.
     """
@@ -87,7 +88,7 @@ class MatchParameters:
     @classmethod
     def paper(cls) -> "MatchParameters":
         """Section 7.4: k = 30, WKS with 100 energies, s = 5, 20 ICP steps, then ICP at k = 100 and 300."""
-        return cls(k_quotient=0, k_max=300, refinement="icp", icp_tolerance=0.0)
+        return cls(k_quotient=0, k_max=300, refinement="icp", local_weight=0.0, icp_tolerance=0.0)
 
     def changed(self, **values: object) -> "MatchParameters":
         """A copy with some values changed, checked again."""

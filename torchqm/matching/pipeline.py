@@ -19,7 +19,7 @@ from torchqm.matching.known import (
     transferred_symmetry,
 )
 from torchqm.matching.parameters import MatchParameters
-from torchqm.matching.prepared import COST, DETECTION, match_prepared, orientation_label
+from torchqm.matching.prepared import COST, DETECTION, match_prepared
 from torchqm.matching.quality import commutativity_score, orientation_agreement
 from torchqm.matching.result import MatchResult, SymmetryResult
 from torchqm.matching.shape import N_ANCHORS, PreparedShape, prepare
@@ -117,7 +117,8 @@ def find_symmetry(
     known = collection.symmetry(shape, symmetry)
     scores = [commutativity_score(m, shape.basis, shape.basis) for m in known.group.maps]
     agreement = [orientation_agreement(shape.mesh, shape.mesh, m) for m in known.group.maps]
-    labels = [orientation_label(a) if shape.oriented else "unknown" for a in agreement]
+    names = {1.0: "direct", -1.0: "mirrored"}
+    labels = [names[float(o)] if shape.oriented else "unknown" for o in known.orientation]
     return SymmetryResult(
         known.group.maps,
         ("direct", *labels[1:]),
@@ -253,7 +254,7 @@ class Collection:
         if known.origin != "extrinsic" or not 2 <= known.details.get("planes", 1) <= 3:
             return known
         found = self._own(shape, "detect")
-        return found if found.group.order > known.group.order else known
+        return found if found.firm and found.group.order > known.group.order else known
 
     def transfer(self, shape: PreparedShape, reference: PreparedShape, known: KnownSymmetry) -> KnownSymmetry:
         """A shape's symmetry by transfer from another; trivial if that has none."""

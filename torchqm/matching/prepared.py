@@ -11,7 +11,7 @@ from torchqm.matching.initial import basis_size
 from torchqm.matching.known import KnownSymmetry, no_symmetry
 from torchqm.matching.orbits import full_map_from_orbits, quotient_size
 from torchqm.matching.parameters import MatchParameters
-from torchqm.matching.quality import commutativity_score, orientation_agreement
+from torchqm.matching.quality import commutativity_score, map_label, orientation_agreement
 from torchqm.matching.quotient import (
     choose_halves,
     dense_map,
@@ -26,7 +26,7 @@ from torchqm.matching.steps import Steps
 from torchqm.matching.subgroups import common_symmetry, one_reflection
 from torchqm.symmetry.orientation import orientation_cosine, orientation_tensor
 
-__all__ = ["COST", "DETECTION", "POOR_SCORE", "map_label", "match_prepared", "orientation_label"]
+__all__ = ["COST", "DETECTION", "POOR_SCORE", "match_prepared"]
 
 POOR_SCORE = 0.15
 """Commutativity score above which a map is called poor; true maps of TOSCA have 0.03 (wolf) to 0.13 (cat)."""
@@ -191,23 +191,3 @@ def _spectrum_warning(shape: PreparedShape, k: int, rtol: float = 1e-3, most: fl
         f"{shape.mesh.label}: ambiguous spectrum: {equal} of the first {k} eigenvalues equal their neighbour to "
         f"{rtol:g}; the shape has more symmetry than one reflection, and which functions belong together is arbitrary"
     )
-
-
-def map_label(agreement: float, cosine: float) -> str:
-    """Name of a map: by its triangles if they say it clearly, else by how it carries smooth functions.
-
-    Triangles smaller than the errors of a map are turned over here and there even if the map is right everywhere.
-
-    Args:
-        agreement: :func:`torchqm.matching.quality.orientation_agreement`.
-        cosine: :func:`torchqm.symmetry.orientation.orientation_cosine`.
-    """
-    label = orientation_label(agreement)
-    if label == "unknown" and abs(cosine) > 0.5 and agreement * cosine > 0:
-        return "direct" if cosine > 0 else "mirrored"
-    return label
-
-
-def orientation_label(agreement: float) -> str:
-    """Name of a map by its orientation agreement; a map that is right on three quarters of the area has 0.5."""
-    return "direct" if agreement > 0.3 else "mirrored" if agreement < -0.3 else "unknown"

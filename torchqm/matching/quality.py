@@ -9,7 +9,15 @@ from torchqm.geometry.mesh import Mesh
 from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.basis import SpectralBasis
 
-__all__ = ["commutativity_score", "commutator_norm", "distance_change", "orientation_agreement", "torn_length"]
+__all__ = [
+    "commutativity_score",
+    "commutator_norm",
+    "distance_change",
+    "map_label",
+    "orientation_agreement",
+    "orientation_label",
+    "torn_length",
+]
 
 
 def commutativity_score(
@@ -80,6 +88,26 @@ def orientation_agreement(mesh_x: Mesh, mesh_y: Mesh, p2p_xy: Int[Tensor, " Vx"]
     sign = torch.sign((image * normals[corners[:, 0]]).sum(1))
     weight = mesh_x.face_areas * (sign != 0)
     return float((sign * weight).sum() / weight.sum().clamp_min(1e-300))
+
+
+def map_label(agreement: float, cosine: float) -> str:
+    """Name of a map: by its triangles if they say it clearly, else by how it carries smooth functions.
+
+    Triangles smaller than the errors of a map are turned over here and there even if the map is right everywhere.
+
+    Args:
+        agreement: :func:`orientation_agreement`.
+        cosine: :func:`torchqm.symmetry.orientation.orientation_cosine`.
+    """
+    label = orientation_label(agreement)
+    if label == "unknown" and abs(cosine) > 0.5 and agreement * cosine > 0:
+        return "direct" if cosine > 0 else "mirrored"
+    return label
+
+
+def orientation_label(agreement: float) -> str:
+    """Name of a map by its orientation agreement; a map that is right on three quarters of the area has 0.5."""
+    return "direct" if agreement > 0.3 else "mirrored" if agreement < -0.3 else "unknown"
 
 
 def torn_length(mesh: Mesh, p2p: Int[Tensor, " V"]) -> float:

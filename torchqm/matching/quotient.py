@@ -9,7 +9,7 @@ from torch import Tensor
 from torchqm.fmap.convert import fmap_to_p2p
 from torchqm.fmap.refine import correspondence_fmap, growing_sizes, quotient_icp, upsample
 from torchqm.fmap.two_way import Places, two_way_upsample
-from torchqm.matching.initial import basis_size, initial_fmap, shared_descriptors
+from torchqm.matching.initial import basis_size, curvature_descriptors, initial_fmap, shared_descriptors
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.features import local_features
@@ -73,7 +73,8 @@ def match_quotient(
         y: target.
         group_x: symmetry group of the source.
         group_y: symmetry group of the target.
-        parameters: ``k``, descriptors, ``commutativity``, ``icp_steps``, ``time``, ``n_samples`` are used.
+        parameters: ``k``, descriptors, ``commutativity``, ``icp_steps``, ``time``, ``n_samples`` are used; with
+            ``local_weight`` above 0 curvature is a descriptor, too.
         k: functions instead of ``parameters.k``: of a large group only few of these are symmetric.
 
     References:
@@ -83,7 +84,8 @@ def match_quotient(
     source = symmetrized_basis(x.basis.truncate(k), group_x)
     target = symmetrized_basis(y.basis.truncate(k), group_y)
     values_x, values_y = shared_descriptors([x.basis, y.basis], parameters)
-    first = initial_fmap(source.even, target.even, values_x, values_y, parameters.commutativity)
+    more = curvature_descriptors(x, y) if parameters.local_weight > 0 else None
+    first = initial_fmap(source.even, target.even, values_x, values_y, parameters.commutativity, more)
     samples, among = x.samples[: parameters.n_samples], target.even.restricted(y.anchors)
     fmap = quotient_icp(
         first, source.even, among, samples, parameters.icp_steps, parameters.time, tolerance=parameters.icp_tolerance
@@ -174,7 +176,7 @@ def pair_places(x: PreparedShape, y: PreparedShape, parameters: MatchParameters)
         bases = [s.basis.truncate(min(parameters.k_max, s.basis.k)) for s in (x, y)]
         oriented = x.oriented and y.oriented
         features = local_features(bases, [x.curvature, y.curvature], ids, oriented)
-    first, second = (Places(i, f, parameters.n_samples) for i, f in zip(ids, features, strict=True))
+    first, second = (Places(i, f, min(parameters.n_samples, len(i))) for i, f in zip(ids, features, strict=True))
     return first, second
 
 

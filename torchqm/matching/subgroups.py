@@ -32,11 +32,12 @@ def subgroups(products: Int[Tensor, "G G"], n_generators: int = 3) -> list[Eleme
         [(0, 1, 2, 3), (0, 1), (0, 2), (0, 3), (0,)]
     """
     order = products.shape[0]
+    subgroup(products, [0])  # is it a group? once, and not for each of its parts
     found: set[Elements] = {(0,)}
     frontier: set[Elements] = {(0,)}
     for _ in range(n_generators):
         larger = {
-            tuple(sorted(subgroup(products, [*have, new])))
+            tuple(sorted(subgroup(products, [*have, new], check=False)))
             for have in frontier
             for new in range(order)
             if new not in have
@@ -51,7 +52,8 @@ def common_symmetry(
 ) -> tuple[KnownSymmetry, KnownSymmetry]:
     """The largest subgroups of the same kind of two groups, cut out of both; the groups themselves if they are equal.
 
-    Of one kind are subgroups of the same name that turn over the orientation with as many elements. Where several pairs
+    Of one kind are subgroups of the same name that turn over the orientation with as many elements (which is not asked
+    of surfaces without an orientation). Where several pairs
     are, that one is taken whose symmetric functions have the most similar eigenvalues: the quotients of isometric
     shapes by matching groups are isometric.
 
@@ -64,10 +66,11 @@ def common_symmetry(
     References:
         Paper, Lemma 3.2.
     """
-    kind_x, kind_y = (_kind(known, tuple(range(known.group.order))) for known in (known_x, known_y))
+    oriented = x.oriented and y.oriented
+    kind_x, kind_y = (_kind(known, tuple(range(known.group.order)), oriented) for known in (known_x, known_y))
     if kind_x == kind_y:
         return known_x, known_y
-    own, other = _by_kind(known_x), _by_kind(known_y)
+    own, other = _by_kind(known_x, oriented), _by_kind(known_y, oriented)
     shared = [kind for kind in own if kind in other]
     largest = max(shared, key=lambda kind: (len(own[kind][0]), kind[1]))
     return _best_pair(x, y, known_x, known_y, own[largest], other[largest])
@@ -94,18 +97,18 @@ def first_reflection(x: PreparedShape, known: KnownSymmetry) -> KnownSymmetry | 
     return known.subset(found[0], x, {}) if found else None
 
 
-def _kind(known: KnownSymmetry, elements: Elements) -> tuple[str, int]:
+def _kind(known: KnownSymmetry, elements: Elements, oriented: bool = True) -> tuple[str, int]:
     chosen = list(elements)
     table = known.products[chosen][:, chosen]
     number = {old: new for new, old in enumerate(chosen)}
     small = torch.tensor([[number[int(v)] for v in row] for row in table])
-    return group_name(small), int((known.orientation[chosen] < 0).sum())
+    return group_name(small), int((known.orientation[chosen] < 0).sum()) if oriented else 0
 
 
-def _by_kind(known: KnownSymmetry) -> dict[tuple[str, int], list[Elements]]:
+def _by_kind(known: KnownSymmetry, oriented: bool = True) -> dict[tuple[str, int], list[Elements]]:
     found: dict[tuple[str, int], list[Elements]] = {}
     for elements in subgroups(known.products):
-        found.setdefault(_kind(known, elements), []).append(elements)
+        found.setdefault(_kind(known, elements, oriented), []).append(elements)
     return found
 
 

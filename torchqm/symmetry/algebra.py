@@ -121,8 +121,13 @@ def conjugacy_classes(products: Int[Tensor, "G G"]) -> list[list[int]]:
     return [(first == c).nonzero()[:, 0].tolist() for c in first.unique().tolist()]
 
 
-def subgroup(products: Int[Tensor, "G G"], generators: Sequence[int]) -> list[int]:
+def subgroup(products: Int[Tensor, "G G"], generators: Sequence[int], check: bool = True) -> list[int]:
     """The elements of the smallest subgroup that contains the generators, ascending (so the identity is first).
+
+    Args:
+        products: multiplication table.
+        generators: numbers of elements.
+        check: whether it is checked that the table is a group, which takes longest where it is large.
 
     Raises:
         ValueError: the table is no group, or a generator is no element of it.
@@ -131,7 +136,8 @@ def subgroup(products: Int[Tensor, "G G"], generators: Sequence[int]) -> list[in
         >>> subgroup(torch.tensor([[0, 1, 2, 3], [1, 2, 3, 0], [2, 3, 0, 1], [3, 0, 1, 2]]), [2])
         [0, 2]
     """
-    _check(products)
+    if check:
+        _check(products)
     order = products.shape[0]
     if any(not 0 <= g < order for g in generators):
         raise ValueError(f"generators are {list(generators)}, but the elements are 0 to {order - 1}")
