@@ -172,3 +172,11 @@ def test_few_functions_are_enough(exact):
     assert found.fmaps.shape == (2, 20, 20)
     gap = exact.x.mesh.verts[found.group.maps[1]] - exact.x.mesh.verts[exact.group_x.maps[1]]
     assert float(gap.norm(dim=1).mean()) < 0.01
+
+
+def test_small_triangles_do_not_hide_a_group():
+    """At 60 functions a right map turns many of these triangles over; smooth functions say what it does."""
+    shape = prepare(creature("octopus", 800, pose=4, retriangulate=2).mesh, 60)
+    found = detect_group(shape, MatchParameters(k_max=60))
+    assert abs(found.parts["orientation"]) < 0.3
+    assert (found.verdict, found.group.order) == ("symmetric", 16)

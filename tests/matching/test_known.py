@@ -112,13 +112,16 @@ def test_a_given_symmetry_has_the_halves_of_its_axis():
     assert given.warnings == []
 
 
-def test_rotations_and_swaps_are_no_reflections():
+def test_a_half_turn_is_a_group_and_swaps_are_no_reflections():
     body = creature("ellipsoid", 800)
     shape = prepare(body.mesh, 20)
     verts = body.mesh.verts
     turn = next(g for g in body.base_group if sum(bool((verts[:, a] * verts[g, a]).sum() < 0) for a in range(3)) == 2)
-    with pytest.raises(ValueError, match=r"keeps the orientation of the surface .*: a rotation"):
-        given_symmetry(shape, torch.stack([torch.arange(shape.n_verts), turn]))
+    known = given_symmetry(shape, torch.stack([torch.arange(shape.n_verts), turn]))
+    assert known.name == "C2"
+    assert known.orientation.tolist() == [1.0, 1.0]
+    assert not known.reflection
+    assert float(known.sign.abs().max()) == 0
     swap = torch.arange(shape.n_verts)
     swap[[3, 9]] = torch.tensor([9, 3])
     with pytest.raises(ValueError, match=r"it moves only 0\.\d% of the area"):

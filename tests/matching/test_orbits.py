@@ -2,10 +2,12 @@
 
 import pytest
 import torch
+import trimesh
 
 from torchqm.data.synthetic import creature, exact_maps
 from torchqm.fmap import fmap_to_p2p
-from torchqm.matching import MatchParameters, given_symmetry, match_quotient, no_symmetry, prepare
+from torchqm.geometry import Mesh
+from torchqm.matching import MatchError, MatchParameters, given_symmetry, match_quotient, no_symmetry, prepare
 from torchqm.matching.orbits import full_map_from_orbits, quotient_size
 
 SMALL = MatchParameters(k_max=150)
@@ -56,3 +58,17 @@ def test_functions_that_a_group_needs():
     assert quotient_size(2, MatchParameters()) == 30
     assert quotient_size(8, MatchParameters()) == 80
     assert quotient_size(48, MatchParameters()) == 200
+
+
+def test_a_mesh_that_is_too_coarse_for_its_group_is_named():
+    """Each vertex of this ellipsoid lies on a mirror plane: none has eight different images."""
+    ball = trimesh.creation.icosphere(subdivisions=0)
+    signs = torch.tensor([[a, b, c] for a in (1, -1) for b in (1, -1) for c in (1, -1)], dtype=torch.float64)
+    mesh = Mesh.from_arrays(ball.vertices * [1.0, 1.3, 1.7], ball.faces, "coarse")
+    images = torch.stack([torch.cdist(s * mesh.verts, mesh.verts).argmin(1) for s in signs])
+    x = prepare(mesh, 6)
+    known = given_symmetry(x, images)
+    parameters = MatchParameters(k=4, k_max=6)
+    match = match_quotient(x, x, known.group, known.group, parameters)
+    with pytest.raises(MatchError, match=r"coarse -> coarse: .*none has 8 different images"):
+        full_map_from_orbits(match, x, x, known, known, parameters)

@@ -12,7 +12,7 @@ from torchqm.matching import (
     prepare,
     refine_by_icp,
 )
-from torchqm.matching.quotient import dense_map, refine_fmap
+from torchqm.matching.quotient import dense_map, pair_places, refine_fmap
 from torchqm.symmetry import SymmetryGroup
 from torchqm.testing import assert_orbit_equal
 
@@ -134,3 +134,11 @@ def test_orbit_map_uses_the_time(exact, found):
         at = QuotientMatch(found.source, found.target, spoilt, time).orbit_map(exact.x, exact.y)
         right.append(float((exact.group_y.orbits[at] == exact.p2p_xy[:, None]).any(1).double().mean()))
     assert right[1] > right[0]
+
+
+def test_no_more_points_ask_than_there_are(exact):
+    for places in pair_places(exact.x, exact.y, FAST):
+        assert places.n_queries == len(places.ids) == 642
+    bare = pair_places(exact.x, exact.y, FAST.changed(local_weight=0.0))[0]
+    assert bare.features.shape == (642, 0)
+    assert pair_places(exact.x, exact.y, FAST.changed(n_samples=50))[1].n_queries == 50

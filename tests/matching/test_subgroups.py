@@ -1,12 +1,13 @@
 """torchqm.matching.subgroups: all of them, and those of two shapes that belong together."""
 
+from dataclasses import replace
 from itertools import permutations
 
 import pytest
 import torch
 
 from torchqm.data.synthetic import creature
-from torchqm.matching import extrinsic_symmetry, no_symmetry, prepare
+from torchqm.matching import extrinsic_symmetry, given_symmetry, no_symmetry, prepare
 from torchqm.matching.subgroups import common_symmetry, first_reflection, one_reflection, subgroups
 
 
@@ -88,3 +89,16 @@ def test_one_reflection(eggs):
     assert first.reflection
     none = no_symmetry(x)
     assert one_reflection(x, y, none, other) == (none, other)
+
+
+def test_orientation_is_not_asked_of_surfaces_that_have_none():
+    """What noise made of the parity of an element must not part two equal groups."""
+    body = creature("ellipsoid", 600)
+    x = prepare(body.mesh, 60)
+    known = given_symmetry(x, body.base_group)
+    pair = [known.subset([0, int((known.orientation * sign > 0).nonzero()[-1])], x, {}) for sign in (1, -1)]
+    own, other = common_symmetry(x, x, *pair)
+    assert own.group.order == other.group.order == 1
+    bare = replace(x, oriented=False)
+    own, other = common_symmetry(bare, bare, *pair)
+    assert own.group.order == other.group.order == 2

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchqm.data.synthetic import creature
 from torchqm.matching.symmetry_file import SymmetryFileError, load_symmetry, return_error
 
 
@@ -153,3 +154,16 @@ def test_faults_name_the_file_and_what_is_wrong(tmp_path, shape, reflection, fau
     with pytest.raises(SymmetryFileError, match=FAULTS[fault]) as error:
         load_symmetry(path, shape.mesh)
     assert str(error.value).startswith(str(path))
+
+
+def test_a_half_turn_is_read_beside_the_identity_and_refused_alone(tmp_path):
+    """Alone in a file it would be taken for a reflection, and labels would be wrong."""
+    body = creature("ellipsoid", 600)
+    turn = body.base_group[int((body.orientation > 0).nonzero()[1])]
+    assert torch.equal(turn[turn], torch.arange(body.mesh.n_verts))
+    both, alone = tmp_path / "both.npy", tmp_path / "alone.npy"
+    np.save(both, torch.stack([torch.arange(body.mesh.n_verts), turn]).numpy())
+    np.save(alone, turn.numpy())
+    assert torch.equal(load_symmetry(both, body.mesh).maps[1], turn)
+    with pytest.raises(SymmetryFileError, match=r"alone\.npy: .*keeps the orientation of the surface"):
+        load_symmetry(alone, body.mesh)

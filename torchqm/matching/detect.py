@@ -47,9 +47,9 @@ class Detection:
         name: of the group, such as ``C2`` or ``D8`` (order 16).
         verdict: ``symmetric``, ``ambiguous`` or ``asymmetric``.
         parts: the numbers behind it, of maps before local features settled them
-            (:func:`torchqm.matching.self_map.settled_self_map`). ``score`` (of the best candidate at 100 functions), ``runner_up`` (of the best
-            candidate that is no element of the group), ``margin`` (their ratio), ``refused`` (how many good maps did
-            not fit into the group). Of the best vertex map:
+            (:func:`torchqm.matching.self_map.settled_self_map`). ``score`` (of the best candidate at 100 functions),
+            ``runner_up`` (of the best candidate that is no element of the group), ``margin`` (their ratio), ``refused``
+            (how many good maps did not fit into the group). Of the best vertex map:
             ``commutativity`` (150 functions; with ``score`` it decides by :data:`SYMMETRIC` and :data:`ASYMMETRIC`),
             ``embedding`` (relative distance between the image of a delta and the delta that it is taken for),
             ``involution`` (mean distance between x and S(S(x)) / sqrt(area)), ``moved`` (share of the area that goes

@@ -17,7 +17,7 @@ from torchqm.matching.parity import odd_halves
 from torchqm.matching.quality import orientation_agreement
 from torchqm.matching.self_map import nearest_involution
 from torchqm.matching.shape import PreparedShape
-from torchqm.matching.symmetry_file import MAX_RETURN_ERROR, closure_fault, reflection_fault, return_error
+from torchqm.matching.symmetry_file import closure_fault, reflection_fault, return_error
 from torchqm.matching.transfer import transfer_symmetry
 from torchqm.symmetry.algebra import group_name
 from torchqm.symmetry.extrinsic import ExtrinsicReflection, extrinsic_group, find_reflections
@@ -240,13 +240,14 @@ def given_symmetry(shape: PreparedShape, maps: Tensor, origin: str = "file") -> 
     none = torch.zeros_like(shape.basis.mass)
     if group.order == 1:
         return KnownSymmetry(group, none, origin)
-    rotation = shape.oriented and orientation_agreement(shape.mesh, shape.mesh, group.maps[1]) > 0.3
-    if group.order > 2 or (rotation and return_error(shape.mesh, group.maps[1]) <= MAX_RETURN_ERROR):
+    if group.order > 2:
         return _given_group(shape, group, origin)
     reflection = group.maps[1]
-    fault = reflection_fault(shape.mesh, reflection)
+    fault = reflection_fault(shape.mesh, reflection, half_turns=True)
     if fault is not None:
         raise MatchError(f"{shape.mesh.label}: row 1 of the symmetry is no reflection: {fault}")
+    if shape.oriented and orientation_agreement(shape.mesh, shape.mesh, reflection) > 0.3:
+        return _given_group(shape, group, origin)
     error = return_error(shape.mesh, reflection)
     return KnownSymmetry(group, _halves(shape, reflection), origin, [], {"involution_error": error})
 

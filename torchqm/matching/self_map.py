@@ -21,13 +21,13 @@ from torchqm.symmetry.group import SymmetryGroup
 __all__ = [
     "SelfMap",
     "best_self_map",
-    "settled_self_map",
     "conjugate_reflection",
     "grow_self_map",
     "nearest_involution",
     "reflection_score",
     "self_map_from_halves",
     "self_maps_from_halves",
+    "settled_self_map",
 ]
 
 SelfFMap = Float[Tensor, "K K"]

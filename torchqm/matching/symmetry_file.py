@@ -61,7 +61,7 @@ def return_error(mesh: Mesh, reflection: Int[Tensor, " V"]) -> float:
     return float((moved * unit.vertex_areas).sum())
 
 
-def reflection_fault(mesh: Mesh, reflection: Int[Tensor, " V"]) -> str | None:
+def reflection_fault(mesh: Mesh, reflection: Int[Tensor, " V"], half_turns: bool = False) -> str | None:
     """What speaks against a vertex map being the reflection of a shape, with the numbers; None if nothing does.
 
     Applied twice it must bring points back (:data:`MAX_RETURN_ERROR`), it must move a third of the area at least by
@@ -71,6 +71,7 @@ def reflection_fault(mesh: Mesh, reflection: Int[Tensor, " V"]) -> str | None:
     Args:
         mesh: the shape, any scale.
         reflection: ``(V,)`` vertex map of it.
+        half_turns: whether a rotation that undoes itself is as good.
     """
     error = return_error(mesh, reflection)
     if not error <= MAX_RETURN_ERROR:
@@ -82,7 +83,7 @@ def reflection_fault(mesh: Mesh, reflection: Int[Tensor, " V"]) -> str | None:
     moved = float(unit.vertex_areas[(unit.verts - unit.verts[reflection]).norm(dim=1) > 0.02].sum())
     if moved < 1 / 3:
         return f"it moves only {moved:.1%} of the area (by more than 0.02 sqrt(area)); a reflection moves nearly all"
-    faces = orient_faces(unit)
+    faces = None if half_turns else orient_faces(unit)
     if faces is not None:
         oriented = replace(unit, faces=faces)
         agreement = orientation_agreement(oriented, oriented, reflection)
@@ -115,7 +116,8 @@ def load_symmetry(path: str | Path, mesh: Mesh) -> SymmetryFile:
 
     Three forms are read. ``.npz`` with the key ``maps``, as ``torchqm symmetry`` writes it: ``(G, V)``, row 0 the
     identity. ``.npy`` or text (``.txt``, ``.vts``, ``.csv``, ``.map``) with one reflection, V integers: for each vertex
-    the vertex that it goes to. ``.npy`` or text with a ``(G, V)`` table whose first row is the identity.
+    the vertex that it goes to. ``.npy`` or text with a ``(G, V)`` table whose first row is the identity; such
+    a table of two maps may be a half turn.
 
     Ids count from 0. Where no id is 0 and one is V, they are taken to count from 1, as in the ``.vts`` files of
     correspondence benchmarks, and a note says so. A reflection need not be a permutation, since a real one sends a
@@ -139,6 +141,7 @@ def load_symmetry(path: str | Path, mesh: Mesh) -> SymmetryFile:
     """
     path = Path(path)
     table, notes = _from_one(path, _as_table(path, _read(path), mesh), mesh)
+    alone = table.shape[0] == 1  # without the identity beside it, it is said to be a reflection
     if table.shape[0] == 1:
         table = np.concatenate([np.arange(mesh.n_verts)[None], table])
     elif (table[0] != np.arange(mesh.n_verts)).any():
@@ -147,7 +150,7 @@ def load_symmetry(path: str | Path, mesh: Mesh) -> SymmetryFile:
         )
     maps = torch.from_numpy(np.ascontiguousarray(table))
     for row in range(1, len(maps)):
-        notes += _check_row(path, mesh, maps[row], row, len(maps))
+        notes += _check_row(path, mesh, maps[row], row, len(maps), half_turns=not alone)
     if len(maps) > 2:
         fault, _ = closure_fault(mesh, SymmetryGroup(maps))
         if fault is not None:
@@ -256,7 +259,7 @@ def _from_one(path: Path, table: np.ndarray, mesh: Mesh) -> tuple[np.ndarray, li
     return table, []
 
 
-def _check_row(path: Path, mesh: Mesh, row: Int[Tensor, " V"], number: int, order: int) -> list[str]:
+def _check_row(path: Path, mesh: Mesh, row: Int[Tensor, " V"], number: int, order: int, half_turns: bool) -> list[str]:
     """Refuse what is no symmetry: the identity again, or (of a pair) a map that does not undo itself."""
     where = f"{path}: " + (f"row {number} " if order > 2 else "the map ")
     n = mesh.n_verts
@@ -265,7 +268,7 @@ def _check_row(path: Path, mesh: Mesh, row: Int[Tensor, " V"], number: int, orde
     repeated = n - int(row.unique().numel())
     if order > 2:  # a rotation need not undo itself; the group's own residuals judge it
         return []
-    fault = reflection_fault(mesh, row)
+    fault = reflection_fault(mesh, row, half_turns)
     if fault is not None:
         kind = f"no permutation ({repeated} of {n} ids repeat) and " if repeated else "a permutation, but "
         raise SymmetryFileError(f"{where}is {kind}no reflection: {fault}")
