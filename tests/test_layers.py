@@ -30,7 +30,10 @@ HEAVY = (
     [
         ("torchqm", ("torch", "numpy", "scipy", *HEAVY)),
         ("torchqm.cli.main", ("torch", "numpy", "scipy", *HEAVY)),
-        ("torchqm.matching, torchqm.evaluate, torchqm.data, torchqm.viz, torchqm.testing", HEAVY),
+        (
+            "torchqm.matching, torchqm.matching.baselines, torchqm.evaluate, torchqm.data, torchqm.viz, torchqm.testing",
+            HEAVY,
+        ),
     ],
 )
 def test_nothing_heavy_is_imported(module, heavy):

@@ -1,0 +1,309 @@
+"""``torchqm benchmark``: many methods on many pairs, in several processes, gone on with after a kill."""
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+from torchqm.cli.console import Progress, UserError
+from torchqm.cli.inputs import as_plain
+from torchqm.cli.processes import Failure, in_processes, usable_cores
+
+if TYPE_CHECKING:
+    from torchqm.benchmark import Task
+    from torchqm.benchmark.page import Picture
+    from torchqm.benchmark.summary import PublishedRows
+    from torchqm.data.base import ShapeSet
+
+__all__ = ["DEFAULT_METHODS", "FILES", "add_parser", "run"]
+
+DEFAULT_METHODS = "quotient,zoomout,fmap,descriptors"
+
+FILES = ("pairs.csv", "table.md", "worst.html", "run.json")
+
+_DESCRIPTION = """\
+Run methods on pairs of a set of shapes and compare them: a table, the error curves of the
+paper's figures, and pictures of the worst pairs. Each pair and method is a file of its own
+in OUT/results, so after a kill or an interruption the same command goes on, and more
+methods or pairs can be added later. A pair that fails is a row with its reason."""
+
+_EPILOG = """\
+methods:
+{methods}
+  published:NAME           others' results in the set's own files (SCB): {published}
+
+pairs:
+  {pairs}
+
+files written to OUT:
+  results/METHOD-DIGEST/A+B.json   one pair: numbers, error of each point, seconds, notes; the
+                  map is beside it (A+B.map.npz, p2p: target vertex of each source vertex).
+                  Results of other options or versions are in folders of their own and never
+                  mixed with these. A.json: the symmetry that a method found of a shape.
+  symmetries      symmetries found on the way, each once for all pairs
+  pairs.csv       all numbers, a row for each pair and method
+  table.md        means over the pairs
+  figure6_orbit, figure8_symmetry, figure10_map, figure_plain (.png and .svg)
+  worst.html      pictures of the worst pairs of each method
+  run.json        the command, versions and machine
+
+seconds: of the method itself, symmetries included (column seconds_symmetry: their part, which
+is spent once a shape), eigenfunctions not.
+
+exit status: 0 all pairs done, 1 some failed (the table says why), 2 wrong input,
+130 interrupted."""
+
+
+class _Help(argparse.Action):
+    """``--help`` with the names of all methods; they are in packages that load torch, so only then."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **_: Any) -> None:
+        super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help="show this help and exit")
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        """Print the help and stop."""
+        import textwrap
+
+        from torchqm.data.pairs import PAIRS_HELP
+        from torchqm.data.published import PUBLISHED_METHODS
+        from torchqm.matching.baselines import DESCRIPTIONS
+
+        methods = "\n".join(f"  {name:24} {text}" for name, text in DESCRIPTIONS.items())
+        pairs = "\n  ".join(textwrap.wrap(PAIRS_HELP, 88))
+        parser.epilog = _EPILOG.format(methods=methods, published=", ".join(PUBLISHED_METHODS), pairs=pairs)
+        parser.print_help()
+        parser.exit()
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "benchmark",
+        help="compare methods on the pairs of a set of shapes",
+        description=_DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+        add_help=False,
+    )
+    parser.add_argument("-h", "--help", action=_Help)
+    parser.add_argument(
+        "root", metavar="ROOT", help="the set of shapes, see 'torchqm data check --help': a folder, or 'synthetic:'"
+    )
+    parser.add_argument(
+        "--methods", default=DEFAULT_METHODS, metavar="A,B,...", help="which methods, see below (default %(default)s)"
+    )
+    parser.add_argument(
+        "--pairs",
+        default=None,
+        metavar="SPEC",
+        help="which pairs, see below (default: the published ones if the set has them, else within-class)",
+    )
+    parser.add_argument("--limit", type=_count, metavar="N", help="only the first N pairs")
+    parser.add_argument(
+        "--out", type=Path, default=Path("torchqm-benchmark"), metavar="DIR", help="default: %(default)s"
+    )
+    parser.add_argument("--jobs", type=_count, metavar="N", help="processes of one thread each (default: all cores)")
+    parser.add_argument(
+        "--cache",
+        type=Path,
+        metavar="DIR",
+        help="eigenfunctions ('torchqm prepare') and distances (default: the folder that TORCHQM_CACHE names, else "
+        "OUT/cache)",
+    )
+    parser.add_argument(
+        "--points",
+        type=_points,
+        default=100,
+        metavar="N",
+        help="points at which errors are measured, spread over the shape (default 100); all: all that the truth has; "
+        "landmarks: those of the class (SCB), where published errors with a flip forgiven were measured",
+    )
+    parser.add_argument(
+        "--solver",
+        choices=("fast_marching", "heat", "dijkstra"),
+        default="fast_marching",
+        help="of geodesic distances (default fast_marching; dijkstra to compare with old papers)",
+    )
+    parser.add_argument(
+        "--worst", type=_natural, default=3, metavar="N", help="pairs a method on worst.html (default 3)"
+    )
+    parser.add_argument("--retry", action="store_true", help="run those again that failed before")
+    parser.add_argument("--report", action="store_true", help="run nothing, report what is there")
+    parser.set_defaults(run=run, threads=None, default_threads=1)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run what is missing and write the report; 1 if a pair failed."""
+    shapes, pairs, tasks, published = _plan(arguments)
+    out, jobs = arguments.out, arguments.jobs or usable_cores()
+    with _locked(out):
+        from torchqm.benchmark.ledger import clean
+
+        clean(out)
+        todo = [] if arguments.report else _missing(tasks, arguments.retry)
+        title = f"Comparison on {arguments.root}"
+        print(f"{shapes.recognised[0]}; {len(pairs)} pairs, {len(tasks) - len(todo)} of {len(tasks)} results are there")
+        try:
+            with Progress() as progress:
+                _do(todo, len(tasks), jobs, progress)
+            return _report(arguments, tasks, published, title, jobs)
+        except KeyboardInterrupt:
+            left = len(_missing(todo, False))
+            print(
+                f"torchqm: interrupted; {len(tasks) - left} of {len(tasks)} results are in {out}, the same command "
+                "goes on from there",
+                file=sys.stderr,
+            )
+            return 130
+
+
+def _plan(
+    arguments: argparse.Namespace,
+) -> tuple["ShapeSet", list[tuple[str, str]], "list[Task]", "list[PublishedRows]"]:
+    """All that is to be done, checked before anything is run or written."""
+    from torchqm.benchmark import Settings, choose_methods, plan_tasks
+    from torchqm.benchmark.summary import read_published_rows
+    from torchqm.data import choose_pairs, open_shapes
+    from torchqm.spectral import cache_folder
+
+    names = [name.strip() for name in arguments.methods.split(",") if name.strip()]
+    cache = cache_folder(arguments.cache, arguments.out / "cache")
+    settings = Settings(arguments.root, arguments.out, arguments.points, arguments.solver, cache)
+    try:
+        matchers, others = choose_methods(names)
+        shapes = open_shapes(arguments.root)
+        spec = arguments.pairs or ("published" if shapes.published_pairs() else "within-class")
+        pairs = choose_pairs(shapes, spec)[: arguments.limit]
+        published = [read_published_rows(shapes.root, name, pairs) for name in others]
+        return shapes, pairs, plan_tasks(shapes, matchers, pairs, settings), published
+    except (ValueError, FileNotFoundError) as error:  # a set, pair, truth or file that cannot be used
+        raise UserError(str(error)) from error
+
+
+@contextmanager
+def _locked(out: Path) -> Iterator[None]:
+    """The output folder, made and held: two runs in one folder would do everything twice."""
+    from filelock import FileLock, Timeout
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(out / ".lock", timeout=0)
+        lock.acquire()
+    except Timeout as error:
+        raise UserError(f"{out}: another run is writing there") from error
+    except OSError as error:
+        raise UserError(f"{out}: the output folder cannot be used ({error.strerror or error})") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _missing(tasks: "Sequence[Task]", retry: bool) -> "list[Task]":
+    from torchqm.benchmark.ledger import LedgerError, read_record
+
+    try:
+        records = [read_record(task.path, task.key) for task in tasks]
+    except LedgerError as error:
+        raise UserError(str(error)) from error
+    return [
+        task
+        for task, record in zip(tasks, records, strict=True)
+        if record is None or (retry and record["status"] == "failed")
+    ]
+
+
+def _do(todo: "Sequence[Task]", total: int, jobs: int, progress: Progress) -> None:
+    """Run tasks and tell how far they are; the time left goes by the times of each method so far."""
+    from torchqm.benchmark import run_task
+    from torchqm.benchmark.run import fail_task
+
+    if not todo:
+        return
+    there, kinds = total - len(todo), [(task.matcher.name, task.kind) for task in todo]
+    left = {kind: kinds.count(kind) for kind in kinds}
+    spent: dict[tuple[str, str], list[float]] = {}
+    progress.listener(f"{there} of {total} results", -1.0, 0.0)
+    clock = perf_counter()
+    for count, (number, result) in enumerate(in_processes(run_task, todo, jobs), 1):
+        task, kind = todo[number], kinds[number]
+        if isinstance(result, Failure):
+            fail_task(task, result.reason)
+        # With several processes a result comes every `seconds / jobs`; only ratios matter for the share.
+        seconds, clock = perf_counter() - clock, perf_counter()
+        spent.setdefault(kind, []).append(seconds)
+        left[kind] -= 1
+        done = sum(map(sum, spent.values()))
+        usual = done / count
+        ahead = sum(n * (sum(spent[k]) / len(spent[k]) if k in spent else usual) for k, n in left.items())
+        failed = isinstance(result, Failure) or result == "failed"
+        share = done / (done + ahead) if done + ahead > 0 else 1.0
+        progress.listener(f"{task.label}{' failed' if failed else ''}", seconds, share)
+        progress.listener(f"{there + count} of {total} results", -1.0, share)
+
+
+def _report(
+    arguments: argparse.Namespace, tasks: "Sequence[Task]", published: "Sequence[PublishedRows]", title: str, jobs: int
+) -> int:
+    """Write the tables, figures and the page."""
+    from torchqm.benchmark import write_page, write_summary
+    from torchqm.benchmark.ledger import LedgerError
+    from torchqm.benchmark.page import draw_picture
+    from torchqm.matching.result import write_json
+
+    out = arguments.out
+
+    def draw(pictures: "Sequence[Picture]") -> Iterator[tuple[int, Any]]:
+        # A process takes seconds to start; for a few pictures this one is as quick.
+        yield from in_processes(draw_picture, pictures, min(jobs, 1 + len(pictures) // 8))
+
+    try:
+        rows, files = write_summary(tasks, published, out, title)
+        write_page(tasks, out, title, arguments.worst, draw)
+    except LedgerError as error:
+        raise UserError(str(error)) from error
+    except ValueError as error:
+        if str(error).startswith("rows:"):
+            raise UserError(f"{out}: no result is there yet") from error
+        raise
+    write_json(out / "run.json", {"arguments": as_plain(arguments), **_provenance()})
+    print((out / "table.md").read_text("utf-8"))
+    failed = sum(bool(row.get("reason")) for row in rows)
+    print(f"written: {', '.join(str(out / name) for name in (*FILES, *sorted(set(files) - {'csv', 'table'})))}")
+    return 1 if failed else 0
+
+
+def _provenance() -> dict[str, Any]:
+    import os
+    import platform
+    from importlib import metadata
+
+    from torchqm.version import __version__
+
+    packages = ("torch", "numpy", "scipy")
+    versions = {"torchqm": __version__, "python": platform.python_version()}
+    versions |= {name: metadata.version(name) for name in packages}
+    machine = {"system": f"{platform.system()} {platform.machine()}", "cpus": os.cpu_count()}
+    return {"versions": versions, "machine": machine}
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text}: at least 1")
+    return value
+
+
+def _natural(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text}: at least 0")
+    return value
+
+
+def _points(text: str) -> int:
+    """A number of points; 0 stands for all, -1 for the landmarks."""
+    return {"all": 0, "landmarks": -1}.get(text) if text in ("all", "landmarks") else _count(text)  # type: ignore[return-value]
