@@ -31,7 +31,7 @@ HEAVY = (
         ("torchqm", ("torch", "numpy", "scipy", *HEAVY)),
         ("torchqm.cli.main", ("torch", "numpy", "scipy", *HEAVY)),
         (
-            "torchqm.matching, torchqm.matching.baselines, torchqm.evaluate, torchqm.data, torchqm.viz, torchqm.testing",
+            "torchqm.matching.baselines, torchqm.evaluate, torchqm.data, torchqm.viz, torchqm.testing",
             HEAVY,
         ),
     ],
