@@ -61,6 +61,7 @@ def correlation(a: Float[Tensor, "K K"], b: Float[Tensor, "K K"]) -> float:
     """``tr(A^T B) / K`` of two orthonormal maps: 1 if they are the same, near 0 if they differ everywhere.
 
     Example:
+        >>> import torch
         >>> correlation(torch.eye(4), torch.diag(torch.tensor([1.0, 1.0, 1.0, -1.0])))
         0.5
     """
