@@ -29,9 +29,11 @@ def test_a_symmetry_comes_back_from_its_file(tmp_path, pair):
     assert torch.equal(found.group.maps, known.group.maps)
     assert torch.equal(found.sign, known.sign)
     assert (found.origin, found.warnings, found.name) == (known.origin, known.warnings, known.name)
-    assert load_known(path, 7) is None  # of another shape
+    with pytest.warns(UserWarning, match=r"s\.npz: a kept symmetry that cannot be used.* instead of 7"):
+        assert load_known(path, 7) is None
     path.write_bytes(path.read_bytes()[:100])
-    assert load_known(path, pair[1].n_verts) is None
+    with pytest.warns(UserWarning, match=r"s\.npz: a kept symmetry that cannot be used"):
+        assert load_known(path, pair[1].n_verts) is None
 
 
 @pytest.mark.parametrize("axis", ["auto", "reference"])
@@ -47,10 +49,7 @@ def test_a_match_is_that_of_the_method_and_symmetries_are_found_once(tmp_path, p
     monkeypatch.setattr("torchqm.matching.pipeline.transferred_symmetry", transfer)
     plain = matcher.match(x, y, given)
     results = [match_ours(matcher, x, y, given, KeptCollection(tmp_path, "quotient", PARAMETERS)) for _ in range(2)]
-    assert len(calls) <= 2, (
-        calls,
-        sorted(p.name for p in tmp_path.iterdir()),
-    )  # once by the method itself, once for both of these
+    assert len(calls) == 2  # once by the method itself, once for both of these
     for result in results:
         assert torch.equal(result.maps, plain.maps)
         assert result.labels == plain.labels

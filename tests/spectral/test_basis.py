@@ -2,9 +2,11 @@
 
 import pytest
 import torch
+from references.dense import dense_eigenpairs
 from references.shapes import basis_of
 
-from torchqm.spectral import cluster_end
+from torchqm.geometry import laplacian
+from torchqm.spectral import SpectralBasis, cluster_end
 
 
 @pytest.fixture(scope="module")
@@ -64,3 +66,20 @@ def test_cluster_end_at_the_borders():
     for k in (0, 5):
         with pytest.raises(ValueError, match=rf"k={k}: .* 1\.\.4"):
             cluster_end(equal, k)
+
+
+def test_rows_of_the_biharmonic_embedding_have_biharmonic_distances(mirror_blob):
+    """With all functions: the distances of the squared pseudo-inverse of the Laplacian."""
+    mesh = mirror_blob.mesh.normalized()
+    operator = laplacian(mesh, "cotan")
+    evals, evecs = dense_eigenpairs(operator, mesh.n_verts)
+    full = SpectralBasis(evals.clamp_min(0), evecs, operator.mass)
+    half = operator.mass.sqrt()
+    matrix = operator.stiffness.to_dense() / half[:, None] / half
+    inverse = torch.linalg.pinv(matrix, hermitian=True, rtol=1e-9)
+    kernel = inverse @ inverse / half[:, None] / half
+    wanted = (kernel.diagonal()[:, None] + kernel.diagonal() - 2 * kernel).clamp_min(0).sqrt()
+    points = full.biharmonic()
+    torch.testing.assert_close(torch.cdist(points, points), wanted, atol=1e-6, rtol=1e-4)
+    assert full.biharmonic(20).shape == (mesh.n_verts, 19)
+    torch.testing.assert_close(full.biharmonic(20), points[:, :19])

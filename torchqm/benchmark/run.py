@@ -13,7 +13,7 @@ from torch import Tensor
 from torchqm.benchmark.ledger import write_record
 from torchqm.benchmark.measure import Measured, measure_pair, measure_symmetry, undeformed
 from torchqm.benchmark.plan import Task, functions_of, parameters_of
-from torchqm.benchmark.symmetries import KeptCollection, match_ours, shape_symmetry
+from torchqm.benchmark.symmetries import KeptCollection, match_ours
 from torchqm.data.base import ShapeSet
 from torchqm.data.folder import SameIdShapes
 from torchqm.data.layouts import open_shapes
@@ -159,7 +159,7 @@ def _symmetry(task: Task) -> dict[str, Any]:
         return {"status": "none", "reason": "the set knows no true reflection of it", "row": {}, "errors": {}}
     if isinstance(task.matcher, Ours):
         collection = _collection(task, task.matcher)
-        known = shape_symmetry(task.matcher, x, _given(task, shapes).reference, collection)
+        known = task.matcher.symmetry(x, _given(task, shapes).reference, collection)
         turned = (known.orientation < 0).nonzero().flatten().tolist()
         if not turned:
             raise MatchError("; ".join(["no reflection was found", *known.warnings]))

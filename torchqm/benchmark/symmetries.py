@@ -2,8 +2,10 @@
 
 import hashlib
 import json
+import warnings
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +16,14 @@ from torchqm.benchmark.ledger import file_name
 from torchqm.geometry.files import write_whole
 from torchqm.matching.baselines import BaselineResult, Given, Ours
 from torchqm.matching.known import KnownSymmetry
-from torchqm.matching.parameters import MatchError, MatchParameters
+from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.pipeline import Collection
-from torchqm.matching.prepared import match_prepared
 from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.cache_file import content_hash
 from torchqm.symmetry.group import SymmetryGroup
 from torchqm.version import __version__
 
-__all__ = ["KeptCollection", "load_known", "match_ours", "save_known", "shape_symmetry"]
+__all__ = ["KeptCollection", "load_known", "match_ours", "save_known"]
 
 
 def save_known(path: Path, known: KnownSymmetry, seconds: float) -> None:
@@ -36,13 +37,15 @@ def save_known(path: Path, known: KnownSymmetry, seconds: float) -> None:
 
 
 def load_known(path: Path, n_verts: int) -> tuple[KnownSymmetry, float] | None:
-    """What :func:`save_known` wrote; None if there is no such file, or it cannot be used and is to be made anew."""
+    """What :func:`save_known` wrote; None if there is no such file, or (with a warning) if it cannot be used."""
+    if not path.exists():
+        return None
     try:
         with np.load(path, allow_pickle=False) as kept:
             arrays = {name: torch.from_numpy(kept[name]) for name in kept.files if name != "about"}
             about = json.loads(str(kept["about"]))
         if arrays["maps"].shape[1] != n_verts or len(arrays["sign"]) != n_verts:
-            return None
+            raise ValueError(f"of {arrays['maps'].shape[1]} vertices instead of {n_verts}")
         known = KnownSymmetry(
             SymmetryGroup(arrays["maps"]),
             arrays["sign"],
@@ -53,7 +56,8 @@ def load_known(path: Path, n_verts: int) -> tuple[KnownSymmetry, float] | None:
             arrays.get("turned"),
         )
         return known, float(about["seconds"])
-    except (OSError, ValueError, KeyError, EOFError, IndexError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, EOFError, IndexError, zipfile.BadZipFile) as error:
+        warnings.warn(f"{path}: a kept symmetry that cannot be used, found anew ({error})", stacklevel=2)
         return None
 
 
@@ -88,8 +92,9 @@ class KeptCollection(Collection):
         key = [self._hash(reference), given, self.way]
         return self._once(shape, "transfer", key, lambda: super(KeptCollection, self).transfer(shape, reference, known))
 
-    def _own(self, shape: PreparedShape, how: str) -> KnownSymmetry:
-        return self._once(shape, how, [], lambda: super(KeptCollection, self)._own(shape, how))
+    def own_symmetry(self, shape: PreparedShape, how: str) -> KnownSymmetry:
+        """See :meth:`Collection.own_symmetry`."""
+        return self._once(shape, how, [], lambda: super(KeptCollection, self).own_symmetry(shape, how))
 
     def _hash(self, shape: PreparedShape) -> str:
         if id(shape) not in self._hashes:
@@ -129,46 +134,6 @@ def match_ours(
     Raises:
         MatchError: as there.
     """
-    if matcher.axis == "true":
-        return matcher.match(x, y, given)
-    given.check(x, y)
-    if matcher.axis == "reference" or (matcher.axis == "known" and given.reference is not None):
-        known_x, known_y = (shape_symmetry(matcher, shape, given.reference, collection) for shape in (x, y))
-        result = match_prepared(x, y, known_x, known_y, matcher.method, collection.parameters, collection.steps)
-        origin = "the symmetries come from the reference"
-    else:
-        result, origin = collection.match(x, y), "the symmetries come from the two shapes"
-    steps = {
-        "symmetries": collection.symmetry_seconds,
-        "matching": collection.total_seconds - collection.symmetry_seconds,
-    }
-    return BaselineResult(
-        matcher.name,
-        result.maps,
-        result.labels,
-        steps,
-        [origin, *result.warnings],
-        {"scores": result.scores.tolist()},
-    )
-
-
-def shape_symmetry(
-    matcher: Ours, shape: PreparedShape, reference: PreparedShape | None, collection: KeptCollection
-) -> KnownSymmetry:
-    """The symmetry that one of torchqm's methods finds of one shape.
-
-    Args:
-        matcher: the method.
-        shape: the shape.
-        reference: an undeformed pose, for methods that use one.
-        collection: where symmetries are kept.
-
-    Raises:
-        MatchError: the method needs a reference and there is none.
-    """
-    if matcher.axis == "auto" or (matcher.axis == "known" and reference is None):
-        return collection.symmetry(shape, "auto")
-    if reference is None:
-        raise MatchError(f"{matcher.name}: needs a reference, an undeformed pose of the shape that has a mirror plane")
-    known = collection.symmetry(reference, "extrinsic")
-    return known if shape.mesh is reference.mesh else collection.transfer(shape, reference, known)
+    result = matcher.match(x, y, given, collection)
+    matching = collection.total_seconds - collection.symmetry_seconds
+    return replace(result, steps={"symmetries": collection.symmetry_seconds, "matching": matching})

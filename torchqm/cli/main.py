@@ -26,6 +26,7 @@ first steps:
   torchqm symmetry cat3.off --reference cat0.off
   torchqm data check FOLDER                     what a data set holds, and what is wrong with it
   torchqm prepare FOLDER                        eigenfunctions of all its shapes, kept for later runs
+  torchqm benchmark FOLDER                      methods compared on its pairs; FOLDER may be 'synthetic:'
 
 'torchqm COMMAND --help' explains a command. Exit status: 0 done, 1 some shapes of a
 data set could not be used (the others were), 2 wrong input (one line on stderr says which

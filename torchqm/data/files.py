@@ -1,12 +1,12 @@
 """The small files of data sets: vertex ids and from what number they count, barycentric points, pairs, names."""
 
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from torchqm.geometry.formats import numbers
 from torchqm.geometry.io import READABLE
 
 __all__ = [
@@ -20,16 +20,6 @@ __all__ = [
     "read_table",
     "recognise_base",
 ]
-
-
-def numbers(text: str) -> np.ndarray | None:
-    """All numbers of a text, or None if something in it is none."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # numpy's way of saying that it stopped early
-            return np.fromstring(text, sep=" ")
-    except (DeprecationWarning, ValueError):
-        return None
 
 
 def read_lines(path: Path) -> list[tuple[int, str]]:

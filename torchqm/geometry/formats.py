@@ -11,7 +11,7 @@ import numpy as np
 
 from torchqm.geometry.check import MeshError
 
-__all__ = ["READERS"]
+__all__ = ["READERS", "numbers"]
 
 _OFF_EDGE = re.compile(r"(?:2\s+)?\d+\s+\d+")
 _OFF_HEADER = re.compile(r"^(?:(?:ST)?C?N?OFF\b|OFF(?=\d))")  # some writers glue the counts to the header: OFF490 518 0
@@ -56,13 +56,13 @@ class _Lines:
         """
         block = [self.lines[i][skip:] for i in rows if i < len(self.lines)]
         columns = len(block[0].split()) if block else width
-        flat = _numbers(" ".join(block))
+        flat = numbers(" ".join(block))
         if len(block) == len(rows) and columns >= width and flat is not None and len(flat) == len(rows) * columns:
             out = flat.reshape(len(rows), columns)[:, :width]
         else:  # lines of different lengths, or a fault: find out which
             out = np.empty((len(rows), width))
             for k, i in enumerate(rows):
-                row = _numbers(" ".join(block[k].split()[:width])) if k < len(block) else None
+                row = numbers(" ".join(block[k].split()[:width])) if k < len(block) else None
                 if row is None or len(row) != width:
                     raise self.fault(i, f"{what} {k} of {len(rows)} ({width} numbers)")
                 out[k] = row
@@ -76,7 +76,7 @@ class _Lines:
         return table.astype(np.int64)
 
 
-def _numbers(text: str) -> np.ndarray | None:
+def numbers(text: str) -> np.ndarray | None:
     """All numbers of a text, or None if something in it is none."""
     if not text:
         return np.zeros(0)
@@ -101,7 +101,7 @@ def _read_off(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise text.fault(0, "a header OFF, COFF, NOFF, CNOFF or STOFF")
     rest = text.lines[0][header.end() :].strip()
     at = 0 if rest else 1  # the counts stand on the header line or on the next one
-    counts = _numbers(rest if rest else (text.lines[1] if len(text.lines) > 1 else ""))
+    counts = numbers(rest if rest else (text.lines[1] if len(text.lines) > 1 else ""))
     if counts is None or len(counts) < 2 or (counts[:2] < 0).any() or (counts[:2] % 1 != 0).any():
         raise text.fault(at, "the numbers of vertices, faces and edges")
     n_verts, n_faces = int(counts[0]), int(counts[1])
@@ -129,7 +129,7 @@ def _off_faces(text: _Lines, start: int, count: int) -> np.ndarray:
     """Faces as ``corners id id id ... [colour]``."""
     block = text.lines[start : start + count]
     columns = len(block[0].split()) if block else 4
-    flat = _numbers(" ".join(block))
+    flat = numbers(" ".join(block))
     if columns >= 4 and flat is not None and len(flat) == count * columns:
         table = flat.reshape(count, columns)
         if (table[:, 0] == 3).all():
@@ -138,7 +138,7 @@ def _off_faces(text: _Lines, start: int, count: int) -> np.ndarray:
     for k, line in enumerate(block):
         words = line.split()
         size = int(words[0]) if words[0].isdigit() else 0
-        row = _numbers(" ".join(words[1 : 1 + size]))
+        row = numbers(" ".join(words[1 : 1 + size]))
         if size < 3 or row is None or len(row) != size:
             raise text.fault(start + k, f"face {k} of {count} (number of corners, at least 3, and their vertex ids)")
         polygons.append(text.whole(row[None], start + k, "face")[0].tolist())
@@ -154,7 +154,7 @@ def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise MeshError(f"{path}: no mesh: no line starts with 'v' or 'f' (line 1 is {text.lines[0][:60]!r})")
     verts = text.table(at_verts, 3, "vertex", skip=2) if at_verts else np.zeros((0, 3))
     block = [re.sub(r"/\S*", "", text.lines[i][2:]) for i in at_faces]  # id/uv/normal -> id
-    flat = _numbers(" ".join(block))
+    flat = numbers(" ".join(block))
     plain = flat is not None and len(flat) == 3 * len(block) and all(len(line.split()) == 3 for line in block)
     if flat is not None and plain and (flat >= 1).all() and (flat % 1 == 0).all():
         return verts, flat.astype(np.int64).reshape(-1, 3) - 1

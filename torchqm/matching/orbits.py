@@ -13,7 +13,6 @@ from torchqm.matching.known import KnownSymmetry
 from torchqm.matching.parameters import MatchError, MatchParameters
 from torchqm.matching.quotient import QuotientMatch
 from torchqm.matching.shape import PreparedShape
-from torchqm.spectral.basis import SpectralBasis
 from torchqm.symmetry.domains import fundamental_domains
 
 __all__ = ["OrbitMatch", "full_map_from_orbits", "quotient_size"]
@@ -84,7 +83,7 @@ def full_map_from_orbits(
     samples = x.samples[: parameters.n_samples]
     orbit_map = match.orbit_map(x, y)
     orbits = known_y.group.maps[:, orbit_map[samples]]
-    points_x, points_y = _embedding(x.basis), _embedding(y.basis)
+    points_x, points_y = x.basis.biharmonic(N_EMBEDDING), y.basis.biharmonic(N_EMBEDDING)
     k = basis_size([x.basis, y.basis], parameters.k)
     small_x, small_y = x.basis.truncate(k), y.basis.truncate(k)
     at_x, at_orbits = small_x.evecs[samples], small_y.evecs[orbits]
@@ -133,11 +132,6 @@ def _spread(places: Float[Tensor, "S D"], room: Float[Tensor, " S"], n: int) -> 
         chosen.append(int((room * distance).argmax()))
         distance = torch.minimum(distance, (places - places[chosen[-1]]).norm(dim=1))
     return chosen
-
-
-def _embedding(basis: SpectralBasis) -> Float[Tensor, "V D"]:
-    small = basis.truncate(min(N_EMBEDDING, basis.k))
-    return small.evecs[:, 1:] / small.evals[1:].clamp_min(torch.finfo(small.evals.dtype).tiny)
 
 
 def _separation(points: Float[Tensor, "V D"], orbits: Int[Tensor, "S G"]) -> Float[Tensor, " S"]:

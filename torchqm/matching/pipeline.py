@@ -218,18 +218,18 @@ class Collection:
                 reference = self.shape(self._reference)
                 known = self.transfer(shape, reference, self.symmetry(reference, how))
             elif how == "auto":
-                known = self._own(shape, "extrinsic")
+                known = self.own_symmetry(shape, "extrinsic")
                 if known.firm:
                     known = self._larger(shape, known)
                 else:
-                    detected = self._own(shape, "detect")
+                    detected = self.own_symmetry(shape, "detect")
                     known = detected if detected.firm or not known.known else known
             else:
-                known = self._own(shape, how)
+                known = self.own_symmetry(shape, how)
             self._symmetries[key] = (shape, known)  # kept like the meshes above
         return self._symmetries[key][1]
 
-    def _own(self, shape: PreparedShape, how: str) -> KnownSymmetry:
+    def own_symmetry(self, shape: PreparedShape, how: str) -> KnownSymmetry:
         """The symmetry that a shape itself shows, by its mirror planes or its spectrum; a reference is not asked."""
         key = (id(shape), how)
         if key not in self._symmetries:
@@ -253,7 +253,7 @@ class Collection:
         """
         if known.origin != "extrinsic" or not 2 <= known.details.get("planes", 1) <= 3:
             return known
-        found = self._own(shape, "detect")
+        found = self.own_symmetry(shape, "detect")
         return found if found.firm and found.group.order > known.group.order else known
 
     def transfer(self, shape: PreparedShape, reference: PreparedShape, known: KnownSymmetry) -> KnownSymmetry:
@@ -262,7 +262,7 @@ class Collection:
             return no_symmetry(shape, list(known.warnings))
         if not known.reflection:
             # What is transferred is one reflection; a larger group is looked for in the shape itself first.
-            found = self._own(shape, "detect")
+            found = self.own_symmetry(shape, "detect")
             if found.known:
                 return found
             single = first_reflection(reference, known)
@@ -330,7 +330,7 @@ class Collection:
     def _at_least(self, shape: PreparedShape, mine: KnownSymmetry, other: KnownSymmetry) -> KnownSymmetry:
         """The group that the spectrum shows, if the other shape has a larger one than is known here, and it helps."""
         if mine.origin == "extrinsic" and mine.group.order < other.group.order:
-            found = self._own(shape, "detect")
+            found = self.own_symmetry(shape, "detect")
             return found if found.group.order > mine.group.order else mine
         return self._larger(shape, mine)
 

@@ -5,6 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.fmap.convert import nearest_used, p2p_to_fmap
+from torchqm.geometry.curvature import vertex_normals
 from torchqm.geometry.mesh import Mesh
 from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.basis import SpectralBasis
@@ -60,17 +61,12 @@ def distance_change(
     samples = x.samples[:n]
     among = y.basis.truncate(k_y).restricted(y.anchors)
     partners = y.anchors[nearest_used(x.basis.evecs[samples, :k_x] @ fmap_xy.T, among)]
-    before, after = _biharmonic(x.basis, k)[samples], _biharmonic(y.basis, k)[partners]
+    before, after = x.basis.biharmonic(k)[samples], y.basis.biharmonic(k)[partners]
     gaps = []
     for step in (len(samples) // 3, len(samples) // 2 + 1):
         gaps.append(((before - before.roll(step, 0)).norm(dim=1), (after - after.roll(step, 0)).norm(dim=1)))
     change = sum(float((b - a).abs().mean()) for b, a in gaps)
     return change / max(sum(float(b.mean()) for b, _ in gaps), 1e-300)
-
-
-def _biharmonic(basis: SpectralBasis, k: int) -> Float[Tensor, "V D"]:
-    small = basis.truncate(min(k, basis.k))
-    return small.evecs[:, 1:] / small.evals[1:].clamp_min(torch.finfo(small.evals.dtype).tiny)
 
 
 def orientation_agreement(mesh_x: Mesh, mesh_y: Mesh, p2p_xy: Int[Tensor, " Vx"]) -> float:
@@ -82,9 +78,7 @@ def orientation_agreement(mesh_x: Mesh, mesh_y: Mesh, p2p_xy: Int[Tensor, " Vx"]
     corners = p2p_xy[mesh_x.faces]
     a, b, c = mesh_y.verts[corners].unbind(1)
     image = torch.linalg.cross(b - a, c - a)
-    normals = torch.zeros_like(mesh_y.verts)
-    for corner in range(3):
-        normals.index_add_(0, mesh_y.faces[:, corner], mesh_y.face_vectors)
+    normals = vertex_normals(mesh_y)
     sign = torch.sign((image * normals[corners[:, 0]]).sum(1))
     weight = mesh_x.face_areas * (sign != 0)
     return float((sign * weight).sum() / weight.sum().clamp_min(1e-300))

@@ -74,6 +74,15 @@ class SpectralBasis:
         """The same functions at some of the vertices only, for searches among these; no longer orthonormal."""
         return SpectralBasis(self.evals, self.evecs[ids], self.mass[ids])
 
+    def biharmonic(self, k: int | None = None) -> Float[Tensor, "V _D"]:
+        """``phi_i / lambda_i`` without the constant: distances of rows are biharmonic distances (Lipman et al. 2010).
+
+        Args:
+            k: functions used, at most; all by default.
+        """
+        small = self if k is None else self.truncate(min(k, self.k))
+        return small.evecs[:, 1:] / small.evals[1:].clamp_min(torch.finfo(small.evals.dtype).tiny)
+
     def low_pass(self, values: Float[Tensor, "V C"], time: float = 0.0) -> Float[Tensor, "V C"]:
         """Project onto the basis and let heat flow for ``time`` (area): ``Phi exp(-time Lambda) Phi^T A f``."""
         return self.evecs @ (torch.exp(-time * self.evals)[:, None] * self.coefficients(values))

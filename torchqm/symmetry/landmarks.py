@@ -182,7 +182,7 @@ def find_landmarks(
     ids = ids[persistence > least * reference][: 2 * most]
     ids = ids[height[ids].argsort(descending=True, stable=True)]
     small = _whole_clusters(basis, N_SMOOTH)
-    places = small.evecs[ids, 1:] / small.evals[1:].clamp_min(tiny)
+    places = small.biharmonic()[ids]
     between = torch.cdist(places, places)
     groups: list[list[int]] = []
     for i in range(len(ids)):

@@ -28,7 +28,7 @@ AXES = ("auto", "reference", "true", "known")
 class Ours:
     """``quotient`` and its variants, ``paper`` and ``semi``; see :func:`torchqm.matching.match`.
 
-    Symmetries are found anew for each pair, and their time counts.
+    Symmetries are found anew for each pair, and their time counts, unless a collection keeps them.
 
     Args:
         method: ``quotient``, ``paper`` or ``semi``.
@@ -61,18 +61,28 @@ class Ours:
             if value not in allowed:
                 raise ValueError(f"{name}={value!r}: allowed are {', '.join(allowed)}")
 
-    def match(self, x: PreparedShape, y: PreparedShape, given: Given = NOTHING) -> BaselineResult:
+    def match(
+        self, x: PreparedShape, y: PreparedShape, given: Given = NOTHING, collection: Collection | None = None
+    ) -> BaselineResult:
         """One map a group element; see :class:`torchqm.matching.baselines.Matcher`.
+
+        Args:
+            x: source.
+            y: target.
+            given: what is known of them.
+            collection: where symmetries are kept between pairs; by default they are found anew.
 
         Raises:
             MatchError: a symmetry or the reference is missing, or does not fit.
         """
         given.check(x, y)
-        collection = Collection(None, self.method, self.parameters)
+        collection = Collection(None, self.method, self.parameters) if collection is None else collection
         if self.axis == "true":
             result, origin = self._true(x, y, given, collection), "the symmetries are given"
-        elif self.axis == "reference" or (self.axis == "known" and given.reference is not None):
-            result, origin = self._referred(x, y, given, collection), "the symmetries come from the reference"
+        elif self._refers(given.reference):
+            known_x, known_y = (self.symmetry(shape, given.reference, collection) for shape in (x, y))
+            result = match_prepared(x, y, known_x, known_y, self.method, collection.parameters, collection.steps)
+            origin = "the symmetries come from the reference"
         else:
             result, origin = collection.match(x, y), "the symmetries come from the two shapes"
         k_max, held = collection.parameters.k_max, min(x.basis.k, y.basis.k)
@@ -80,6 +90,27 @@ class Ours:
         return make_result(
             self.name, x, y, result.maps, collection.steps, result.labels, notes, scores=result.scores.tolist()
         )
+
+    def symmetry(self, shape: PreparedShape, reference: PreparedShape | None, collection: Collection) -> KnownSymmetry:
+        """The symmetry that the method finds of one shape.
+
+        Args:
+            shape: the shape.
+            reference: an undeformed pose, for methods that use one.
+            collection: where symmetries are kept.
+
+        Raises:
+            MatchError: the method needs a reference and there is none.
+        """
+        if not self._refers(reference):
+            return collection.symmetry(shape, "auto")
+        if reference is None:
+            raise MatchError(f"{self.name}: needs a reference, an undeformed pose of the shape that has a mirror plane")
+        known = collection.symmetry(reference, "extrinsic")
+        return known if shape.mesh is reference.mesh else collection.transfer(shape, reference, known)
+
+    def _refers(self, reference: PreparedShape | None) -> bool:
+        return self.axis == "reference" or (self.axis == "known" and reference is not None)
 
     def _true(self, x: PreparedShape, y: PreparedShape, given: Given, collection: Collection) -> MatchResult:
         if given.symmetry_x is None or given.symmetry_y is None:
@@ -90,16 +121,6 @@ class Ours:
                 _known(x, given.symmetry_x, given.side_x),
                 _known(y, given.symmetry_y, given.side_y),
             )
-        return match_prepared(x, y, known_x, known_y, self.method, collection.parameters, collection.steps)
-
-    def _referred(self, x: PreparedShape, y: PreparedShape, given: Given, collection: Collection) -> MatchResult:
-        reference = given.reference
-        if reference is None:
-            raise MatchError(f"{self.name}: needs a reference, an undeformed pose of the shape that has a mirror plane")
-        known = collection.symmetry(reference, "extrinsic")
-        known_x, known_y = (
-            known if s.mesh is reference.mesh else collection.transfer(s, reference, known) for s in (x, y)
-        )
         return match_prepared(x, y, known_x, known_y, self.method, collection.parameters, collection.steps)
 
 
