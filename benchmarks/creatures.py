@@ -46,7 +46,7 @@ class Case:
         return truth, TruthDistances.build(target.mesh, truth)
 
     def run(self, method: str) -> tuple[dict[str, ErrorReport], dict]:
-        parameters = MatchParameters() if method == "quotient" else MatchParameters.paper()
+        parameters = MatchParameters.of(method)
         way = "full_map" if method == "quotient" else "clustering"
         start = perf_counter()
         known_y = extrinsic_symmetry(self.y)

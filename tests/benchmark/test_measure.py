@@ -8,6 +8,7 @@ from torchqm.benchmark.plan import Settings
 from torchqm.data.base import Truth
 from torchqm.data.synthetic_set import SyntheticShapes
 from torchqm.evaluate import SurfacePoints
+from torchqm.geometry import Mesh
 
 
 def settings(tmp_path, points=20):
@@ -73,3 +74,16 @@ def test_points_are_spread_and_the_same_each_time(tmp_path):
     apart = [torch.pdist(verts[chosen]).min() for chosen in (rows, few[among], torch.arange(20))]
     assert min(apart[:2]) > apart[2]
     assert len(evaluation_rows(shapes, "two-0", few, settings(tmp_path, 0))) == len(few)
+
+
+def test_vertices_of_no_face_are_not_measured(tmp_path, monkeypatch):
+    """No path leads to them, and no method finds them: they would make every mean infinite."""
+    shapes = Blobs()
+    mesh, plain = shapes.mesh("flat-0"), shapes.mesh
+    loose = Mesh(torch.cat([mesh.verts, torch.ones(2, 3, dtype=torch.float64)]), mesh.faces, "loose")
+    monkeypatch.setattr(shapes, "mesh", lambda name: loose if name == "flat-0" else plain(name))
+    at = torch.arange(loose.n_verts)
+    for points in (0, loose.n_verts - 1, loose.n_verts):
+        rows = evaluation_rows(shapes, "flat-0", at, settings(tmp_path, points))
+        assert torch.equal(rows, torch.arange(mesh.n_verts))
+    assert int(evaluation_rows(shapes, "flat-0", at[1:], settings(tmp_path, 9)).max()) < mesh.n_verts - 1

@@ -28,6 +28,12 @@ def test_a_shape_with_itself_and_its_symmetry_are_one_row():
     assert rows[1]["reason"] == "why"
 
 
+def test_an_infinite_mean_stays_in_the_table():
+    far = record("a", "c", plain=[0.1]) | {"row": {"plain_mean": None, "plain_median": 0.1}}
+    rows = make_rows([record("a", "b", plain=[0.0]), far])
+    assert [row["plain_mean"] for row in rows] == [0.0, float("inf")]
+
+
 def test_curves_are_means_over_pairs_and_infinity_stays_one():
     curves = make_curves([record("a", "b", plain=[0.0, 0.0]), record("b", "a", plain=[0.2, 9.0])])
     assert curves["plain"]["m"].n_pairs == 2

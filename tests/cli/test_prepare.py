@@ -198,3 +198,19 @@ def test_bad_input(root, tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         prepare(root, "--k", 0)
     assert stop.value.code == 2
+
+
+@pytest.mark.parametrize(("readable", "status"), [(False, 1), (True, 0)])
+def test_a_mesh_that_the_set_cannot_use_is_said(tmp_path, monkeypatch, capsys, readable, status):
+    """Left out of the set, it would otherwise be missed by nobody."""
+    monkeypatch.delenv(cache.CACHE_VARIABLE, raising=False)
+    for number in (0, 1, 2):
+        save_mesh(shapes.blob(1, 1 if number == 1 else 2).mesh, tmp_path / f"tr_reg_00{number}.ply")
+    if not readable:
+        (tmp_path / "tr_reg_001.ply").write_text("no mesh")
+    assert prepare(tmp_path, "--k", "9") == status
+    out, err = capsys.readouterr()
+    assert "2 shapes" in out
+    assert (
+        "tr_reg_001 is left out: 42 vertices where class" if readable else "tr_reg_001 is left out: not a PLY"
+    ) in err

@@ -1,12 +1,14 @@
 import pytest
 import torch
+from references.folders import write_lines, write_mesh
 from references.sets import Blobs
 from torch.utils.data import DataLoader
 
-from torchqm.data.base import Truth, TruthError
+from torchqm.data.base import Truth, TruthError, TruthFileError
 from torchqm.data.collate import collate
 from torchqm.data.dataset import PairDataset, ShapeDataset
 from torchqm.data.items import ItemOptions, make_item
+from torchqm.data.layouts import open_shapes
 from torchqm.evaluate.metrics import SurfacePoints
 
 PLAIN = ItemOptions(keys=("mass",))
@@ -90,6 +92,17 @@ def test_what_happens_without_a_truth_is_a_choice():
     assert list(none[1]) == ["first", "second"]
     assert torch.equal(none[1]["second"]["corr"], torch.arange(42))
     assert "corr" not in PairDataset(Blobs(), pairs, options=PLAIN, truth="none")[1]["first"]
+
+
+def test_a_damaged_truth_is_no_missing_one(tmp_path):
+    """Optional is a truth that there may be none of; a file that cannot be used is always told."""
+    for name in ("a", "b"):
+        write_mesh(tmp_path / f"off/{name}.off")
+        write_lines(tmp_path / f"corres/{name}.vts", range(1, 7))
+    write_lines(tmp_path / "corres/b.vts", [1, 2, 3, 99, 5, 6])
+    pairs = PairDataset(open_shapes(tmp_path), [("a", "b")], options=PLAIN, truth="optional")
+    with pytest.raises(TruthFileError, match=r"b\.vts.*99|99.*b\.vts"):
+        pairs[0]
 
 
 def test_pairs_are_chosen_by_word_and_by_the_names_of_a_part():

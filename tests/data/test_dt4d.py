@@ -35,6 +35,16 @@ def test_characters_and_parts(root):
     assert found(shapes) == {}
 
 
+def test_mirror_images_inside_and_between_characters(root):
+    """Between two the reflection is that of the second, at the points that the truth goes to, whatever their order."""
+    write_lines(root / "corres/big_boy/a.sym.vts", [1, 6])  # its two points change places
+    shapes = open_shapes(root)
+    inside = shapes.mirrored_truth("big_boy/a", "big_boy/a")
+    assert (inside.at.tolist(), inside.points.tolist()) == ([5, 0], [0, 5])
+    between = shapes.mirrored_truth("crypto/b", "big_boy/a")
+    assert dict(zip(between.at.tolist(), between.points.tolist(), strict=True)) == {3: 5, 4: 0, 5: 0}
+
+
 def test_truth_inside_and_between_characters(root):
     shapes = open_shapes(root)
     inside = shapes.truth("crypto/a", "crypto/b")

@@ -71,3 +71,22 @@ def test_faults_of_the_list_are_named(tmp_path, lines, severity, message):
     else:
         with pytest.raises(TruthError, match=message):
             shapes.truth("a", "b")
+
+
+def test_a_heading_of_the_list_is_none_of_its_pairs(tmp_path):
+    for name in ("a", "b"):
+        write_mesh(tmp_path / f"{name}.off")
+    write_lines(tmp_path / "pairs.csv", ["source,target", "a,b"])
+    shapes = open_shapes(tmp_path)
+    assert shapes.published_pairs() == [("a", "b")]
+    assert found(shapes) == {}
+
+
+def test_both_columns_of_the_truth_say_from_what_number_ids_count(tmp_path):
+    """Few landmarks: the largest id of the second shape is not among them, that of the first is."""
+    for name in ("a", "b"):
+        write_mesh(tmp_path / f"{name}.off")
+    write_lines(tmp_path / "pairs.txt", ["a b marks.txt"])
+    write_lines(tmp_path / "marks.txt", [(6, 3), (1, 2)])
+    truth = open_shapes(tmp_path).truth("a", "b")
+    assert (truth.at.tolist(), truth.points.tolist()) == ([5, 0], [2, 1])

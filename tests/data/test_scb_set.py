@@ -10,7 +10,7 @@ from references.folders import found, write_lines, write_mesh
 from torchqm.data.base import TruthError
 from torchqm.data.layouts import open_shapes
 from torchqm.data.published import RESULT_FOLDER
-from torchqm.geometry import save_mesh
+from torchqm.geometry import MeshError, save_mesh
 
 REAL = os.environ.get("TORCHQM_SCB")
 BLOCK = "Stats:\n\tAverage\t[0.1]\n\tPerSampleErrors\t[0.1]\n"
@@ -36,7 +36,6 @@ def test_truth_pairs_and_landmarks(root):
     assert shapes.truth("cat1", "cat0").points.tolist() == list(range(6))
     assert shapes.published_pairs() == [("cat0", "cat1")]
     assert list(shapes.skipped_pairs()) == [("cat1", "cat7")]
-    assert any("*.pid): 0-based" in sentence for sentence in shapes.recognised)
     assert "2 pairs with a published result of BlendedMap, 1 of them" in shapes.recognised[-1]
     assert shapes.about("cat") == ("same vertex ids", "mirror plane of cat0")
     assert shapes.about("gorilla") == ("same vertex ids", "landmarks")
@@ -108,3 +107,20 @@ def test_real_folder():
     mirror = shapes.symmetry(first)
     assert torch.equal(mirror.maps[1][mirror.maps[1]], mirror.maps[0])
     assert torch.equal(shapes.mirrored_truth(first, second).points, mirror.maps[1])
+
+
+def test_an_undeformed_pose_that_cannot_be_read_is_no_class_without_symmetry(root):
+    path = root / "TOSCA/Meshes/cat0.off"
+    path.write_text("\n".join(path.read_text().splitlines()[:4]))  # the header still promises all vertices
+    with pytest.raises(MeshError, match=r"cat0\.off"):
+        open_shapes(root).symmetry("cat1")
+
+
+def test_a_mesh_without_a_header_is_left_out_with_its_reason(root):
+    (root / "TOSCA/Meshes/cat1.off").write_text("no mesh")
+    shapes = open_shapes(root)
+    assert "cat1" not in shapes.names
+    assert list(shapes.unreadable) == ["cat1"]
+    assert set(shapes.excluded) == {"cat1", "cat2"}
+    with pytest.raises(TruthError, match=r"cat1\.off"):
+        shapes.truth("cat0", "cat1")

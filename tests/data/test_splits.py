@@ -72,6 +72,14 @@ def test_the_sets_own_split():
     assert own_split(shapes) == Split(train=("cat-0", "cat-2"), test=("cat-1",))
 
 
+def test_an_own_split_without_a_part_is_no_split():
+    """Files that name nothing that is here must not become an empty training set."""
+    with pytest.raises(SplitError, match="nowhere: its own split has no train shapes"):
+        own_split(Named(["a-0", "a-1"], parts={"train": [], "test": ["a-1"]}))
+    with pytest.raises(SplitError, match="no train and no test shapes"):
+        own_split(Named(["a-0"], parts={"train_cat": ["a-0"]}))
+
+
 NAMES = st.text('aZ0.5-_: #"[]{}é,\x27&*!|>%@`', min_size=1, max_size=6).map(str.strip).filter(bool)
 
 

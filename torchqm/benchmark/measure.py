@@ -123,14 +123,15 @@ def evaluation_rows(shapes: ShapeSet, name: str, at: Int[Tensor, " S"], settings
         TruthError: the truth is at none of the landmarks.
     """
     wanted = settings.points
+    used = shapes.mesh(name).referenced[at].nonzero().flatten()  # no path leads to a vertex of no face
     if wanted < 0:
         benchmark = shapes.benchmark  # type: ignore[attr-defined]  # the plan has checked that it is there
         rows = torch.isin(at, benchmark.landmarks(shapes.shape_class(name))).nonzero().flatten()
         if not len(rows):
             raise TruthError(f"{name}: the truth is at none of the landmarks of its class")
         return rows
-    if wanted == 0 or wanted >= len(at):
-        return torch.arange(len(at))
+    if wanted == 0 or wanted >= len(used):
+        return used
     cls = shapes.shape_class(name)
     pose = name
     if isinstance(shapes, SameIdShapes):
@@ -139,7 +140,7 @@ def evaluation_rows(shapes: ShapeSet, name: str, at: Int[Tensor, " S"], settings
     usable = mesh.referenced
     if len(at) == mesh.n_verts and torch.equal(at, torch.arange(len(at))) and wanted <= int(usable.sum()):
         return _spread(_Pose(mesh), wanted)
-    return _spread_among(mesh.verts[at], wanted)
+    return used[_spread_among(shapes.mesh(name).verts[at[used]], wanted)]
 
 
 class _Pose:

@@ -109,9 +109,7 @@ def choose_methods(names: Iterable[str]) -> tuple[list[Matcher], list[str]]:
 
 def parameters_of(matcher: Ours) -> MatchParameters:
     """The numbers that one of torchqm's methods runs with."""
-    if matcher.parameters is not None:
-        return matcher.parameters
-    return MatchParameters() if matcher.method == "quotient" else MatchParameters.paper()
+    return matcher.parameters or MatchParameters.of(matcher.method)
 
 
 def functions_of(matcher: Matcher) -> int:
@@ -148,6 +146,7 @@ def plan_tasks(
     names = list(dict.fromkeys(name for pair in pairs for name in pair))
     prints = {name: _print(shapes, name) for name in names}
     truths = {pair: _truth_print(shapes, *pair) for pair in pairs}
+    mirrors = {name: _mirror_print(shapes, name) for name in names}
     configs = {matcher.name: _config(matcher, settings) for matcher in matchers}
     tasks = []
 
@@ -163,11 +162,11 @@ def plan_tasks(
     for name in names:
         for matcher in matchers:
             if finds_symmetry(matcher):
-                add(matcher, name, name, "symmetry", "")
+                add(matcher, name, name, "symmetry", mirrors[name])
     for pair in pairs:
         for matcher in matchers:
             if "self" not in matcher.needs:
-                add(matcher, *pair, "pair", truths[pair])
+                add(matcher, *pair, "pair", truths[pair] + mirrors[pair[1]])
     return tasks
 
 
@@ -211,6 +210,12 @@ def _truth_print(shapes: ShapeSet, first: str, second: str) -> str:
     if not len(truth):
         raise TruthError(f"{shapes.root}: no truth from {first} to {second}: there is no true point")
     return truth_digest(truth)
+
+
+def _mirror_print(shapes: ShapeSet, name: str) -> str:
+    """A digest of the true reflection of a shape; empty where none is known (its file may come later)."""
+    truth = None if shapes.layout == "synthetic" else shapes.symmetry_truth(name)
+    return "" if truth is None else truth_digest(truth)
 
 
 def truth_digest(truth: Truth) -> str:

@@ -1,6 +1,7 @@
 """One task of a comparison run, from the two meshes to the result file; what any process can do on its own."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -26,6 +27,9 @@ from torchqm.symmetry.group import SymmetryGroup
 
 __all__ = ["fail_task", "map_path", "run_task"]
 
+NOTED = (UserWarning, RuntimeWarning)
+"""Warnings that become notes of a result; others are about code, not about shapes."""
+
 
 def map_path(result: Path) -> Path:
     """The file with the map that belongs to a result file."""
@@ -40,23 +44,29 @@ def run_task(task: Task) -> str:
     """
     began = perf_counter()
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
+        for category in NOTED:
+            warnings.simplefilter("always", category)
         try:
             record = _pair(task) if task.kind == "pair" else _symmetry(task)
         except Exception as error:  # whatever it is, it belongs to this pair alone
             text = " ".join(str(error).split())
-            fail_task(task, text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}")
+            reason = text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}"
+            fail_task(task, reason, _said(caught))
             return "failed"
-    said = dict.fromkeys(str(warning.message) for warning in caught if issubclass(warning.category, UserWarning))
-    record["notes"] = [*record.get("notes", []), *said]
+    record["notes"] = [*record.get("notes", []), *_said(caught)]
     record["wall_seconds"] = round(perf_counter() - began, 3)
     write_record(task.path, _head(task) | record)
     return str(record["status"])
 
 
-def fail_task(task: Task, reason: str) -> None:
+def fail_task(task: Task, reason: str, notes: Sequence[str] = ()) -> None:
     """Write the result file of a task that failed."""
-    write_record(task.path, _head(task) | {"status": "failed", "reason": reason, "row": {}, "errors": {}})
+    found = {"status": "failed", "reason": reason, "row": {}, "errors": {}, "notes": list(notes)}
+    write_record(task.path, _head(task) | found)
+
+
+def _said(caught: Sequence[warnings.WarningMessage]) -> list[str]:
+    return list(dict.fromkeys(str(warning.message) for warning in caught if issubclass(warning.category, NOTED)))
 
 
 def _head(task: Task) -> dict[str, Any]:

@@ -88,7 +88,9 @@ def make_rows(records: Sequence[Record]) -> list[Record]:
         if record["status"] == "none":
             continue
         name = record["method"], record["source"], record["target"]
-        row = {"method": name[0], "source": name[1], "target": name[2], "class": record.get("class"), **record["row"]}
+        row = {"method": name[0], "source": name[1], "target": name[2], "class": record.get("class")}
+        for key, value in record["row"].items():  # JSON has no infinity
+            row[key] = inf if value is None and key.endswith(("_mean", "_median")) else value
         if record["status"] == "failed":
             row["reason"] = record.get("reason") or "failed"
         if record.get("notes"):

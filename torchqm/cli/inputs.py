@@ -95,7 +95,7 @@ def make_parameters(arguments: argparse.Namespace) -> "MatchParameters":
     """
     from torchqm.matching import MatchParameters
 
-    base = MatchParameters() if arguments.method == "quotient" else MatchParameters.paper()
+    base = MatchParameters.of(arguments.method)
     names = ["descriptor", "refinement", *(field for _, field, _, _ in _OPTIONS)]
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     if "k" in given and "k_max" not in given:

@@ -224,7 +224,8 @@ def _writable(arguments: argparse.Namespace) -> Path:
 def _report(shapes: "ShapeSet", rows: list[_Row | Failure | None], folder: Path) -> int:
     """The table of all shapes, and what it comes to."""
     cells, texts = [], []
-    problems: list[str] = []
+    excluded, unreadable = (getattr(shapes, name, {}) for name in ("excluded", "unreadable"))
+    problems = [f"{name} is left out: {why}" for name, why in excluded.items()]
     for name, row in zip(shapes.names, rows, strict=True):
         if isinstance(row, _Row):
             cells.append([name, str(row.vertices), str(row.functions), row.kind, f"{row.seconds:.2f}"])
@@ -240,7 +241,7 @@ def _report(shapes: "ShapeSet", rows: list[_Row | Failure | None], folder: Path)
     print(f"\n{len(rows)} shapes: " + ", ".join(f"{count} {text}" for text, count in counts.items()))
     print(f"cache: {folder} ({size:.0f} MiB); for later commands: --cache {folder}, or TORCHQM_CACHE={folder}")
     print_warnings(problems)
-    return 1 if counts["failed"] else 0
+    return 1 if counts["failed"] or unreadable else 0
 
 
 def _count(text: str) -> int:

@@ -25,6 +25,10 @@ class TruthError(ValueError):
     """There is no truth for a pair, or its file cannot be used; the message says which and why."""
 
 
+class TruthFileError(TruthError):
+    """The file of a truth cannot be used; the message names it and says why."""
+
+
 class LayoutError(ValueError):
     """A root that is no set of shapes which torchqm knows; the message names it and what was looked for."""
 

@@ -9,7 +9,7 @@ from typing import Any
 from torch import zeros
 from torch.utils.data import Dataset
 
-from torchqm.data.base import ShapeSet, Truth, TruthError
+from torchqm.data.base import ShapeSet, Truth, TruthError, TruthFileError
 from torchqm.data.items import ItemOptions, make_item
 from torchqm.data.pairs import choose_pairs
 
@@ -150,7 +150,8 @@ class PairDataset(Dataset[Item]):
     def _truth(self, first: str, second: str) -> Truth | None:
         try:
             return self.items.shapes.truth(first, second)
-        except TruthError:
-            if self.truth_use == "required":
+        except TruthError as error:
+            # Optional is a truth that there may be none of, not one whose file is damaged.
+            if self.truth_use == "required" or isinstance(error, TruthFileError):
                 raise
             return None

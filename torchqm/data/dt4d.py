@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchqm.data.base import Problem, Truth, TruthError
+from torchqm.data.base import Problem, ShapeSet, Truth, TruthError, TruthFileError
 from torchqm.data.files import read_ids
 from torchqm.data.folder import read_split
 from torchqm.data.meshes import mesh_files
@@ -98,6 +98,11 @@ class Dt4dShapes(VtsShapes):
                     found[pair] = path
         return found
 
+    def mirrored_truth(self, first: str, second: str) -> Truth | None:
+        """Inside a character line by line; between two by the reflection of the second, whose template is another."""
+        same = self.shape_class(first) == self.shape_class(second)
+        return super().mirrored_truth(first, second) if same else ShapeSet.mirrored_truth(self, first, second)
+
     def _across(self, a: str, b: str, n_points: int, n_lines: int) -> Tensor:
         """For each point of a's template one of b's."""
         path = self._cross[a, b]
@@ -107,7 +112,7 @@ class Dt4dShapes(VtsShapes):
                 raise ValueError(f"{path}: {len(ids.values)} lines, but the template of {a} has {n_lines} points")
             return torch.from_numpy(ids.checked(self.base, n_points, f"the template of {b}", "point"))
         except ValueError as error:
-            raise TruthError(str(error)) from error
+            raise TruthFileError(str(error)) from error
 
     @cached_property
     def _parts(self) -> tuple[dict[str, list[str]], list[Problem]]:

@@ -213,19 +213,28 @@ class PairLine:
     extra: str | None = None
 
 
-def read_pairs(path: Path) -> list[PairLine]:
+def read_pairs(path: Path, known: Iterable[str] = ()) -> list[PairLine]:
     """Pairs of names, two a line (a third word may follow), with blanks or a comma between them.
+
+    A first line that says ``first second`` or ``source target`` is a heading, if no shape has such a name.
+
+    Args:
+        path: the file.
+        known: names of shapes.
 
     Raises:
         ValueError: naming file and line.
     """
-    pairs = []
+    pairs: list[PairLine] = []
     for number, line in read_lines(path):
         words = [_without_ending(word) if k < 2 else word for k, word in enumerate(line.replace(",", " ").split())]
         if len(words) not in (2, 3):
             raise ValueError(
                 f"{path}:{number}: expected two names, and perhaps a file with the truth, got {line[:60]!r}"
             )
+        heading = tuple(word.lower() for word in words[:2]) in (("first", "second"), ("source", "target"))
+        if heading and not pairs and not set(words[:2]) & set(known):
+            continue
         pairs.append(PairLine(number, *words))
     return pairs
 

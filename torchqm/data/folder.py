@@ -106,13 +106,14 @@ class SameIdShapes(FolderShapes):
         super().__init__(root, layout, paths, recognised)
         self._files = dict(paths)
         self._symmetries: dict[str, SymmetryGroup | None] = {}
+        self.unreadable: dict[str, str] = {}
         for name, path in paths.items():
             try:
                 self._counts[name] = vertex_count(path)
-            except MeshError:
-                del self._paths[name]  # `problems` says why
+            except MeshError as error:
+                self.unreadable[name] = str(error).removeprefix(f"{path}: ")
         self._class_counts = majority_count((self.shape_class(name), count) for name, count in self._counts.items())
-        self.excluded = {
+        self.excluded = self.unreadable | {
             name: f"{count} vertices where class {cls!r} has {self._class_counts[cls]}: no truth by vertex id, left out"
             for name, count in self._counts.items()
             if count != self._class_counts[cls := self.shape_class(name)]
@@ -169,7 +170,8 @@ class SameIdShapes(FolderShapes):
         return self._files
 
     def _other_problems(self) -> list[Problem]:
-        return [Problem(name, self._files[name], what, "malformed") for name, what in self.excluded.items()]
+        excluded = ((name, what) for name, what in self.excluded.items() if name not in self.unreadable)
+        return [Problem(name, self._files[name], what, "malformed") for name, what in excluded]
 
 
 def base_name(name: str) -> str:
@@ -204,11 +206,12 @@ def mesh_problem(name: str, path: Path, full: bool = False) -> Problem | None:
 
 
 def undeformed_symmetry(shapes: ShapeSet, name: str) -> SymmetryGroup | None:
-    """The symmetries that a pose shows by its mirror planes; None if it has no convincing one, or cannot be read."""
-    try:
-        mesh = shapes.mesh(name)
-    except MeshError:
-        return None
+    """The symmetries that a pose shows by its mirror planes; None if it has no convincing one.
+
+    Raises:
+        MeshError: the pose cannot be read; its class would pass for one without symmetry.
+    """
+    mesh = shapes.mesh(name)
     planes = [plane for plane in find_reflections(mesh) if plane.convincing]
     if len(planes) > 1:
         return extrinsic_group(mesh, planes).group

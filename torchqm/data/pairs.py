@@ -83,11 +83,8 @@ def _from_file(shapes: ShapeSet, path: Path) -> list[tuple[str, str]]:
         raise ValueError(f"pairs {str(path)!r}: no such file, and no known word; allowed are {PAIRS_HELP}")
     known = set(shapes.names)
     lines: dict[tuple[str, str], int] = {}
-    for place, entry in enumerate(read_pairs(path)):
+    for entry in read_pairs(path, known):
         pair = entry.first, entry.second
-        heading = tuple(word.lower() for word in pair) in (("first", "second"), ("source", "target"))
-        if place == 0 and heading and not known & set(pair):
-            continue
         for name in pair:
             if name not in known:
                 raise ValueError(f"{path}:{entry.line}: {_absent(shapes, name)}")

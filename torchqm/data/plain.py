@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchqm.data.base import Problem, Truth, TruthError
+from torchqm.data.base import Problem, Truth, TruthError, TruthFileError
 from torchqm.data.files import PairLine, read_ids, read_pairs, read_table, recognise_base
 from torchqm.data.folder import FolderShapes
 from torchqm.data.meshes import mesh_files
@@ -41,7 +41,7 @@ class PlainShapes(FolderShapes):
         self._pairs: list[PairLine] = []
         if self.pairs_file is not None:
             try:
-                self._pairs = read_pairs(self.pairs_file)
+                self._pairs = read_pairs(self.pairs_file, files)
             except ValueError as error:
                 self._fault = str(error)
         self._truth_files = {
@@ -111,10 +111,11 @@ class PlainShapes(FolderShapes):
 
     def _recognise_numbers(self) -> None:
         usable = []
-        for (_, second), path in self._truth_files.items():
+        for (first, second), path in self._truth_files.items():
             try:
-                table = read_table(path, (1, 2))
-                usable.append((read_ids(path, table.shape[1] - 1).values, self.n_verts(second)))
+                width = read_table(path, (1, 2)).shape[1]
+                owners = (second,) if width == 1 else (first, second)
+                usable += [(read_ids(path, column).values, self.n_verts(name)) for column, name in enumerate(owners)]
             except ValueError:  # `problems` says what is wrong with the file, or the mesh
                 continue
         if usable:
@@ -137,7 +138,7 @@ class PlainShapes(FolderShapes):
         except MeshError:
             raise
         except ValueError as error:
-            raise TruthError(str(error)) from error
+            raise TruthFileError(str(error)) from error
         return Truth(at, to, f"{path.name} ({base}-based)")
 
     def _other_problems(self) -> list[Problem]:

@@ -3,8 +3,7 @@
 from functools import cached_property
 from pathlib import Path
 
-from torchqm.data.base import Problem, Truth, TruthError
-from torchqm.data.files import IndexBase, recognise_base
+from torchqm.data.base import Problem, Truth, TruthFileError
 from torchqm.data.folder import SameIdShapes
 from torchqm.data.meshes import vertex_count
 from torchqm.data.published import PUBLISHED_METHODS, RESULT_FOLDER, read_published
@@ -44,7 +43,7 @@ class ScbShapes(SameIdShapes):
         files = self.benchmark.files
         sentence = f"SCB: TOSCA/Meshes with {len(files)} .off files; the vertex ids of a class agree"
         super().__init__(root, "scb", files, sentence)
-        self.recognised.append(self._landmark_base().why)
+        self.recognised.append("landmarks (TOSCA/Corrs/*.pid): 0-based, as the benchmark has them")
         runnable, skipped = self.published_pairs(), self.skipped_pairs()
         if runnable or skipped:
             self.recognised.append(
@@ -86,7 +85,7 @@ class ScbShapes(SameIdShapes):
         except FileNotFoundError:
             return None
         except ValueError as error:
-            raise TruthError(str(error)) from error
+            raise TruthFileError(str(error)) from error
         return Truth(landmarks, images, f"landmarks of TOSCA/Corrs/{cls}.sym.info")
 
     def published_pairs(self) -> list[tuple[str, str]]:
@@ -106,15 +105,6 @@ class ScbShapes(SameIdShapes):
     @cached_property
     def _has_results(self) -> bool:
         return any((self.benchmark.root / RESULT_FOLDER).glob(f"BenchResult_{_METHOD}_*_to_*.txt"))
-
-    def _landmark_base(self) -> IndexBase:
-        ids = []
-        for cls in self.classes:
-            try:
-                ids.append((self.benchmark.landmarks(cls).numpy(), self.benchmark.n_verts(cls)))
-            except (FileNotFoundError, ValueError):
-                continue  # `problems` says what is wrong
-        return recognise_base("landmarks (TOSCA/Corrs/*.pid)", ids, 0)
 
     def _other_problems(self) -> list[Problem]:
         out = super()._other_problems()

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torchqm.data.base import Problem, Truth, TruthError
+from torchqm.data.base import Problem, Truth, TruthError, TruthFileError
 from torchqm.data.files import read_barycentric, read_ids, recognise_base
 from torchqm.data.folder import FolderShapes, undeformed_symmetry
 from torchqm.data.meshes import mesh_files
@@ -164,7 +164,7 @@ class Shrec16Shapes(FolderShapes):
         except MeshError:
             raise
         except ValueError as error:
-            raise TruthError(str(error)) from error
+            raise TruthFileError(str(error)) from error
 
     def _read_vertices(self, name: str, path: Path, full: str) -> Truth:
         base, ids = self._bases.get(".vts", 1), read_ids(path)

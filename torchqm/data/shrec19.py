@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchqm.data.base import Problem, Truth, TruthError
+from torchqm.data.base import Problem, Truth, TruthError, TruthFileError
 from torchqm.data.files import read_ids, recognise_base
 from torchqm.data.folder import FolderShapes
 from torchqm.data.meshes import mesh_files
@@ -120,7 +120,7 @@ class Shrec19Shapes(FolderShapes):
         except MeshError:
             raise
         except ValueError as error:
-            raise TruthError(str(error)) from error
+            raise TruthFileError(str(error)) from error
 
     def _other_problems(self) -> list[Problem]:
         out = []

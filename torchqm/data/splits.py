@@ -138,9 +138,20 @@ def _mixed(seed: int, salt: str) -> int:
 
 
 def own_split(shapes: ShapeSet) -> Split | None:
-    """The split that a set ships (``train.txt``, ``test.txt``), or None."""
+    """The split that a set ships (``train.txt``, ``test.txt``), or None.
+
+    Raises:
+        SplitError: nothing in it is for training, or nothing for testing.
+    """
     parts = shapes.split()
-    return None if parts is None else Split(**{part: tuple(parts.get(part, ())) for part in PARTS})
+    if parts is None:
+        return None
+    empty = [part for part in ("train", "test") if not parts.get(part)]
+    if empty:
+        raise SplitError(
+            f"{shapes.root}: its own split has no {' and no '.join(empty)} shapes; 'torchqm data check' says more"
+        )
+    return Split(**{part: tuple(parts.get(part, ())) for part in PARTS})
 
 
 def write_split_file(path: str | Path, split: Split, notes: Mapping[str, Any] | None = None) -> Path:

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchqm.data.base import Problem, Truth, TruthError
+from torchqm.data.base import Problem, Truth, TruthError, TruthFileError
 from torchqm.data.files import Ids, read_ids, read_pairs, recognise_base
 from torchqm.data.folder import FolderShapes, majority_count
 from torchqm.data.meshes import mesh_files
@@ -94,7 +94,7 @@ class VtsShapes(FolderShapes):
             return None
         at, points = self._ids(name, self._raw, ".vts"), self._ids(name, self._raw_sym, ".sym.vts")
         if len(at) != len(points):
-            raise TruthError(
+            raise TruthFileError(
                 f"{self._file(name, '.sym.vts')}: {len(points)} lines, but {self._file(name, '.vts')} has {len(at)}"
             )
         return Truth(at, points, f"{self._called('.sym.vts')} ({self.base}-based)")
@@ -141,7 +141,7 @@ class VtsShapes(FolderShapes):
         path = self._pairs_file()
         if path is None:
             return []
-        pairs = read_pairs(path)
+        pairs = read_pairs(path, self._paths)
         for pair in pairs:
             for name in (pair.first, pair.second):
                 if name not in self._paths:
@@ -217,7 +217,7 @@ class VtsShapes(FolderShapes):
     def _ids(self, name: str, raw: Mapping[str, Ids], ending: str) -> Tensor:
         self.require(name)
         if name + ending in self._faults:
-            raise TruthError(self._faults[name + ending].what)
+            raise TruthFileError(self._faults[name + ending].what)
         if name not in raw:
             place = self.place.truth or self.place.root / "corres"
             raise TruthError(f"{place / (name + ending)}: no such file, so there is no truth for {name}")

@@ -90,6 +90,11 @@ class MatchParameters:
         """Section 7.4: k = 30, WKS with 100 energies, s = 5, 20 ICP steps, then ICP at k = 100 and 300."""
         return cls(k_quotient=0, k_max=300, refinement="icp", local_weight=0.0, icp_tolerance=0.0)
 
+    @classmethod
+    def of(cls, method: str) -> "MatchParameters":
+        """The parameters that belong to a method: those that measured best for ``quotient``, else the paper's."""
+        return cls() if method == "quotient" else cls.paper()
+
     def changed(self, **values: object) -> "MatchParameters":
         """A copy with some values changed, checked again."""
         return replace(self, **values)  # type: ignore[arg-type]

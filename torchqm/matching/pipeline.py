@@ -171,7 +171,7 @@ class Collection:
             raise ValueError(f"method={method!r}: allowed are {', '.join(METHODS)}")
         self.method = method
         self.cache_dir = cache_dir
-        self.parameters = parameters or (MatchParameters() if method == "quotient" else MatchParameters.paper())
+        self.parameters = parameters or MatchParameters.of(method)
         self.steps = Steps(listener=listener)
         self.way = "full_map" if method == "quotient" else "clustering"
         self._shapes: dict[int, tuple[Mesh, PreparedShape]] = {}

@@ -6,6 +6,7 @@ from references.pairs import FAST
 
 from torchqm.matching import MatchError, MatchParameters
 from torchqm.matching.baselines import Given, Ours
+from torchqm.matching.baselines.ours import _known
 
 SMALL = MatchParameters(k_max=80)
 
@@ -48,12 +49,13 @@ def test_a_pose_that_is_the_reference_keeps_its_own_plane(walkers):
     assert [step for step in found.steps if "transfer" in step] == [f"symmetry transfer to {walkers.x.mesh.name}"]
 
 
-def test_the_sides_decide_left_and_right(exact):
-    """Semi-quotient matching chooses halves by the signs: with one turned round the two maps change places."""
-    table = (exact.group_x.maps, exact.group_y.maps)
-    side_x, side_y = exact.x.mesh.verts[:, 0], exact.y.mesh.verts[:, 0]
-    told = [Ours("semi", "true", FAST).match(exact.x, exact.y, Given(*table, s * side_x, side_y)) for s in (1, -1)]
-    assert all(torch.equal(result.maps[0], exact.p2p_xy) for result in told)  # ranked by orientation all the same
+def test_given_sides_are_used_and_the_axis_has_none(exact):
+    table, side = exact.group_x.maps, exact.x.mesh.verts[:, 0]
+    fixed = table[1] == torch.arange(len(side))
+    for s in (1.0, -1.0):
+        known = _known(exact.x, table, s * side + 1e-17)  # on the axis the side is rounding
+        assert torch.equal(known.sign == 0, fixed)
+        assert torch.equal(known.sign[~fixed], s * side[~fixed].sign())
 
 
 def test_what_it_refuses(walkers):

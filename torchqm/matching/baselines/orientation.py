@@ -23,6 +23,7 @@ from torchqm.matching.baselines.base import NOTHING, BaselineResult, Given, make
 from torchqm.matching.baselines.zoomout import zoomout, zoomout_sizes
 from torchqm.matching.initial import basis_size, unit_columns_pair
 from torchqm.matching.parameters import MatchError
+from torchqm.matching.quality import orientation_agreement, orientation_label
 from torchqm.matching.shape import PreparedShape
 from torchqm.matching.steps import Steps
 from torchqm.spectral.basis import SpectralBasis
@@ -197,4 +198,5 @@ class OrientRev:
             p2p = fmap_to_p2p(fmap, small, small, search=x.search, guide=x.search)
             p2p = zoomout(p2p, x.basis, x.basis, zoomout_sizes(k, k_max, self.step), x.search, x.search)
         notes = [f"basis from {k} to {k_max} functions by {self.step}"]
-        return make_result(self.name, x, x, p2p, steps, ("mirrored",), notes, k=k_max)
+        label = orientation_label(orientation_agreement(x.mesh, x.mesh, p2p))
+        return make_result(self.name, x, x, p2p, steps, (label,), notes, k=k_max)

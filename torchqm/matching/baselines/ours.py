@@ -17,6 +17,7 @@ from torchqm.matching.pipeline import METHODS, Collection
 from torchqm.matching.prepared import match_prepared
 from torchqm.matching.result import MatchResult
 from torchqm.matching.shape import PreparedShape
+from torchqm.symmetry.leftright import halves_of_reflection
 
 __all__ = ["AXES", "Ours"]
 
@@ -126,4 +127,6 @@ class Ours:
 
 def _known(shape: PreparedShape, table: Int[Tensor, "G V"], side: Float[Tensor, " V"] | None) -> KnownSymmetry:
     known = given_symmetry(shape, table)
-    return known if side is None or not known.reflection else replace(known, sign=side.sign().to(known.sign.dtype))
+    if side is None or not known.reflection:
+        return known
+    return replace(known, sign=halves_of_reflection(shape.mesh, table[1], side).to(known.sign.dtype))
