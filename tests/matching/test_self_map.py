@@ -6,6 +6,7 @@ from references.pairs import FAST, K
 
 from torchqm.fmap import p2p_to_fmap
 from torchqm.matching import nearest_involution
+from torchqm.matching.quotient import pair_places
 from torchqm.matching.self_map import (
     best_self_map,
     conjugate_reflection,
@@ -140,8 +141,9 @@ def test_settling_mends_a_noisy_map_and_keeps_an_exact_one(exact, involution):
     wanted, k = true_map(exact), min(K, 60)
     start = nearest_involution(true_map(exact) + 0.03 * noise(K, K))
     parameters = FAST.changed(n_samples=642)
+    places, _ = pair_places(exact.x, exact.x, parameters)
     for begun in (wanted, start):
-        found = settled_self_map(begun, exact.x, parameters, involution, start=30)
+        found = settled_self_map(begun, exact.x, parameters, places, involution, start=30)
         torch.testing.assert_close(found[:k, :k], wanted[:k, :k], atol=1e-2, rtol=0)
     if involution:
         torch.testing.assert_close(found, found.T, atol=1e-10, rtol=0)
@@ -150,5 +152,6 @@ def test_settling_mends_a_noisy_map_and_keeps_an_exact_one(exact, involution):
 
 def test_features_alone_do_not_turn_left_to_right(exact):
     """They are the same at both: from the identity, the identity comes back, not the reflection."""
-    found = settled_self_map(identity(K), exact.x, FAST.changed(n_samples=642), False, start=30)
+    places, _ = pair_places(exact.x, exact.x, FAST.changed(n_samples=642))
+    found = settled_self_map(identity(K), exact.x, FAST, places, False, start=30)
     torch.testing.assert_close(found, identity(K), atol=1e-2, rtol=0)

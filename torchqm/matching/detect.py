@@ -15,8 +15,9 @@ from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.parity import odd_halves
 from torchqm.matching.proposals import Judge, Proposal, correlation, propose
 from torchqm.matching.quality import commutativity_score, map_label, orientation_agreement
+from torchqm.matching.quotient import pair_places
 from torchqm.matching.self_map import grow_self_map, settled_self_map
-from torchqm.matching.shape import N_ANCHORS, PreparedShape
+from torchqm.matching.shape import PreparedShape
 from torchqm.symmetry.algebra import group_name
 from torchqm.symmetry.group import SymmetryGroup
 
@@ -102,27 +103,20 @@ def detect_group(x: PreparedShape, parameters: MatchParameters | None = None) ->
 def _judged(judge: Judge, pool: Sequence[Proposal], found: FunctionalGroup, parameters: MatchParameters) -> Detection:
     """Refine the elements, make them vertex maps and measure the best one."""
     x, elements = judge.x, found.elements[1:] or pool[:1]
-    fmaps, maps = [], []
-    # The elements of a large group were averaged over all products already, and there are many of them.
-    few = parameters if len(elements) == 1 else parameters.changed(n_samples=min(1000, parameters.n_samples))
-    n_anchors = N_ANCHORS if len(elements) == 1 else 3000
-    for element in elements:
-        with one_thread():
-            fmap = grow_self_map(element.fmap, x, few, parameters.k_max, n_anchors, element.involution)
-        fmaps.append(fmap)
-        maps.append(_point_map(fmap, x))
-    parts = _parts(x, fmaps[0], maps[0])
-    parts["score"] = elements[0].score
+    best = elements[0]
+    with one_thread():
+        fmap = grow_self_map(best.fmap, x, parameters, parameters.k_max, involution=best.involution)
+    p2p = _point_map(fmap, x)
+    parts = _parts(x, fmap, p2p)
+    parts["score"] = best.score
     rest = [p.score for p in pool if all(correlation(p.fmap, e.fmap) <= ALIKE for e in elements)]
     parts["runner_up"] = min(rest, default=float("inf"))
     parts["margin"] = parts["runner_up"] / max(parts["score"], 1e-300)
     parts["refused"] = float(found.tried)
-    orientation = torch.tensor([1.0, *(float(e.orientation) for e in elements)], dtype=torch.float64)
-    agreement = [orientation_agreement(x.mesh, x.mesh, m) if x.oriented else 0.0 for m in maps]
-    parts["orientation"] = agreement[0]
+    parts["orientation"] = orientation_agreement(x.mesh, x.mesh, p2p) if x.oriented else 0.0
     # Small triangles are turned over by the errors of a right map; smooth functions are not.
-    label = map_label(agreement[0], judge.orientation(fmaps[0])) if x.oriented else ""
-    turned = not x.oriented or label == ("direct" if elements[0].orientation > 0 else "mirrored")
+    label = map_label(parts["orientation"], judge.orientation(fmap)) if x.oriented else ""
+    turned = not x.oriented or label == ("direct" if best.orientation > 0 else "mirrored")
     numbers, name = _text(parts), x.mesh.label
     verdict, warnings = "symmetric", []
     faults = [
@@ -151,15 +145,23 @@ def _judged(judge: Judge, pool: Sequence[Proposal], found: FunctionalGroup, para
     sign = torch.zeros_like(x.basis.mass)
     if verdict == "asymmetric":
         group, products = SymmetryGroup.trivial(x.n_verts), torch.zeros(1, 1, dtype=torch.int64)
+        elements, fmaps = elements[:1], [fmap]
     else:
-        # The numbers above are those of maps that know nothing of local features, which would flatter them.
+        # The numbers above are those of a map that knows nothing of local features, which would flatter it.
+        places, _ = pair_places(x, x, parameters)
+        if len(elements) > 1:  # they were averaged over all products already, and there are many of them
+            places = places.fewer(1000, 3000)
         with one_thread():
-            fmaps = [settled_self_map(f, x, few, e.involution) for f, e in zip(fmaps, elements, strict=True)]
-        maps = [_point_map(fmap, x) for fmap in fmaps]
-        group = SymmetryGroup(torch.stack([torch.arange(x.n_verts), *maps]))
+            starts = [fmap, *(element.fmap for element in elements[1:])]
+            fmaps = [
+                settled_self_map(start, x, parameters, places, element.involution)
+                for start, element in zip(starts, elements, strict=True)
+            ]
+        group = SymmetryGroup(torch.stack([torch.arange(x.n_verts), *(_point_map(f, x) for f in fmaps)]))
         products = found.products
-        if group.order == 2 and elements[0].orientation < 0:
+        if group.order == 2 and best.orientation < 0:
             sign = odd_halves(x.mesh, x.basis, fmaps[0])
+    orientation = torch.tensor([1.0, *(float(e.orientation) for e in elements)], dtype=torch.float64)
     scores = torch.tensor([0.0, *(e.score for e in elements)], dtype=torch.float64)
     identity = torch.eye(len(fmaps[0]), dtype=fmaps[0].dtype)
     return Detection(

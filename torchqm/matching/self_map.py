@@ -10,11 +10,10 @@ from torch import Tensor
 from torchqm.fmap.convert import nearest_used, p2p_to_fmap
 from torchqm.fmap.refine import growing_sizes, nearest_isometry, quotient_icp, upsample
 from torchqm.fmap.solve import solve_fmap
-from torchqm.fmap.two_way import growing_pairs, two_way_upsample
+from torchqm.fmap.two_way import Places, growing_pairs, two_way_upsample
 from torchqm.matching.initial import basis_size, shared_descriptors, unit_columns_pair
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.quality import commutator_norm
-from torchqm.matching.quotient import pair_places
 from torchqm.matching.shape import N_ANCHORS, PreparedShape
 from torchqm.symmetry.group import SymmetryGroup
 
@@ -171,6 +170,7 @@ def settled_self_map(
     fmap: Float[Tensor, "K K"],
     x: PreparedShape,
     parameters: MatchParameters,
+    places: Places,
     involution: bool = True,
     start: int = 60,
     weight: float = 1.0,
@@ -183,12 +183,12 @@ def settled_self_map(
     Args:
         fmap: in the first K functions.
         x: the shape.
-        parameters: ``growth``, ``k_max``, ``n_samples`` are used.
+        parameters: ``growth`` and ``k_max`` are used.
+        places: points of the shape with features (:func:`torchqm.matching.quotient.pair_places`).
         involution: whether it is one, and is made one after each step.
         start: functions that are kept.
         weight: of the features (:func:`torchqm.fmap.two_way.two_way_upsample`).
     """
-    places, _ = pair_places(x, x, parameters)
     start, k = min(start, fmap.shape[0]), min(parameters.k_max, x.basis.k)
     project = nearest_involution if involution else nearest_isometry
     sizes = growing_pairs((start, start), (max(start, k), max(start, k)), parameters.growth)
