@@ -166,7 +166,7 @@ class OrientRev:
     Example:
         >>> from torchqm.data.synthetic import creature
         >>> from torchqm.matching import prepare
-        >>> x = prepare(creature("ellipsoid", 500).mesh, k=40)
+        >>> x = prepare(creature("quadruped", 800).mesh, k=40)
         >>> OrientRev().match(x, x).labels
         ('mirrored',)
     """
