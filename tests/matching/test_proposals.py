@@ -8,7 +8,19 @@ from references.shapes import icosphere
 
 from torchqm.geometry import Mesh
 from torchqm.matching import MatchParameters, prepare
-from torchqm.matching.proposals import SAME, Judge, Proposal, correlation, different, grown, propose, regrown
+from torchqm.matching.proposals import (
+    SAME,
+    Judge,
+    Proposal,
+    _ranked,
+    _unseen,
+    correlation,
+    different,
+    grown,
+    propose,
+    regrown,
+)
+from torchqm.matching.quality import distance_change
 from torchqm.matching.self_map import nearest_involution, reflection_score
 
 FULL = MatchParameters(k_max=100)
@@ -134,6 +146,37 @@ def test_all_symmetries_of_an_ellipsoid_are_proposed(ellipsoid):
     assert found == set(range(1, 8))
     for i, one in enumerate(pool):
         assert all(correlation(one.fmap, other.fmap) <= SAME for other in pool[:i])
+
+
+def test_a_likely_permutation_is_not_dropped_for_beginning_badly(biped):
+    """Of those with the same number the first stands for all; nothing is grown that was there already."""
+    right, half = biped.fmaps[1][:40, :40], biped.half(1, 1).fmap[:40, :40]
+    rough = [
+        Proposal(half, -1, True, 0.1, likely=-1),
+        Proposal(half, -1, True, 0.2, likely=0),
+        Proposal(right, -1, True, 0.8, likely=3),
+        Proposal(half, -1, True, 0.9, likely=3),
+    ]
+    (found,) = _unseen(rough, [replace(rough[1], fmap=biped.half(1, 1).fmap[:60, :60])], biped.judge, FULL)
+    assert (found.likely, found.fmap.shape) == (3, (60, 60))
+    assert correlation(found.fmap, biped.fmaps[1][:60, :60]) > 0.97
+    kept = [
+        replace(rough[1], fmap=biped.half(1, 1).fmap[:60, :60]),
+        Proposal(biped.fmaps[1][:60, :60], -1, True, 0.1, likely=-1),
+    ]
+    assert _unseen(rough, kept, biped.judge, FULL) == []  # the map is there, from another permutation
+
+
+def test_between_close_maps_distances_decide(biped):
+    """Right and wrong maps with scores as they are met; one whose score is far above the best stays behind it."""
+    right, half = biped.fmaps[1], biped.half(1, 1).fmap
+    change = [distance_change(fmap, biped.shape, biped.shape) for fmap in (right, half)]
+    assert change[0] < change[1]
+    wrong, close, far = Proposal(half, -1, True, 0.10), Proposal(right, -1, True, 0.13), Proposal(right, -1, True, 0.14)
+    assert _ranked([wrong, close], biped.shape) == [close, wrong]
+    assert _ranked([far, wrong], biped.shape) == [wrong, far]
+    turning = replace(close, orientation=1, score=0.101)
+    assert _ranked([turning, replace(close, score=0.12)], biped.shape)[0].orientation == -1
 
 
 def test_signs_of_eigenfunctions_where_there_are_few_tips():

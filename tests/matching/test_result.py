@@ -9,7 +9,10 @@ import torch
 
 from torchqm.matching import MatchParameters, MatchResult, SymmetryResult
 from torchqm.matching.result import write_json, write_npz
+from torchqm.spectral import SpectralBasis
 
+MODES = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, -2.0], [1.0, -1.0, 1.0]], dtype=torch.float64)
+MODES = MODES / MODES.norm(dim=0)
 MAPS = torch.tensor([[3, 2, 1], [0, 1, 2]])
 
 
@@ -39,6 +42,7 @@ def symmetry():
         torch.tensor([[0, 1, 2], [2, 1, 0]]),
         ("direct", "mirrored"),
         torch.tensor([0.0, 0.3], dtype=torch.float64),
+        SpectralBasis(torch.tensor([0.0, 1.0, 3.0], dtype=torch.float64), MODES, torch.ones(3, dtype=torch.float64)),
         "extrinsic",
     )
 
@@ -74,9 +78,25 @@ def test_match_file(result, tmp_path):
     }
 
 
+def test_a_symmetry_has_its_functional_matrices_and_bases(symmetry):
+    """Of a path of three vertices turned over, the mode in the middle is the odd one."""
+    flip = torch.diag(torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64))
+    assert torch.allclose(symmetry.fmaps, torch.stack([torch.eye(3, dtype=torch.float64), flip]), atol=1e-12)
+    split = symmetry.symmetrized
+    assert torch.allclose(split.even_evals, torch.tensor([0.0, 3.0], dtype=torch.float64), atol=1e-12)
+    assert torch.allclose(split.odd_evals, torch.tensor([1.0], dtype=torch.float64), atol=1e-12)
+    assert torch.allclose(split.even.evecs, split.even.evecs[[2, 1, 0]], atol=1e-12)
+    assert torch.allclose(split.odd.evecs, -split.odd.evecs[[2, 1, 0]], atol=1e-12)
+    assert symmetry.verdict == "symmetric"
+    assert replace(symmetry, details={"verdict": "ambiguous"}).verdict == "ambiguous"
+    alone = replace(symmetry, maps=symmetry.maps[:1], labels=("direct",), scores=symmetry.scores[:1])
+    assert (alone.verdict, alone.symmetrized.odd.k) == ("asymmetric", 0)
+
+
 def test_symmetry_file(symmetry, tmp_path):
     with np.load(symmetry.save(tmp_path / "symmetry.npz"), allow_pickle=False) as file:
-        assert set(file) == {"maps", "labels", "scores"}
+        assert set(file) == {"maps", "labels", "scores", "fmaps"}
+        assert np.array_equal(file["fmaps"], symmetry.fmaps.numpy())
         assert file["maps"].dtype == np.int64
         assert file["maps"].tolist() == symmetry.maps.tolist()
         assert file["labels"].tolist() == ["direct", "mirrored"]

@@ -44,6 +44,13 @@ def _finite(text: str) -> float:
 # Option, field of MatchParameters, type, what it is. The defaults in the texts are checked by a test.
 _OPTIONS: tuple[tuple[str, str, Callable[[str], float], str], ...] = (
     ("--k", "k", int, "eigenfunctions in which the first map is computed (default 30)"),
+    (
+        "--k-quotient",
+        "k_quotient",
+        int,
+        "eigenfunctions whose symmetric ones a second candidate is grown in (half of the surface is enough); up to k: "
+        "no second candidate (default 60; paper and semi 0)",
+    ),
     ("--k-max", "k_max", int, "eigenfunctions that the refinement reaches (default 200; paper and semi 300)"),
     ("--n-descriptors", "n_descriptors", int, "energies of the WKS, times of the HKS (default 100)"),
     (
@@ -55,6 +62,12 @@ _OPTIONS: tuple[tuple[str, str, Callable[[str], float], str], ...] = (
     ("--commutativity", "commutativity", _finite, "weight of the commutativity with the Laplacian (default 100)"),
     ("--icp-steps", "icp_steps", int, "steps of quotient ICP, section 4.3 (default 20)"),
     ("--time", "time", _finite, "diffusion time of the deltas, the shape's area being 1 (default 0)"),
+    (
+        "--local-weight",
+        "local_weight",
+        _finite,
+        "of curvature and WKS against spectral coordinates in the refinement; 0: none (default 2; paper and semi 0)",
+    ),
     ("--samples", "n_samples", int, "vertices that stand for the surface (default 2000)"),
     ("--seed", "seed", int, "of the samples; the same seed gives the same maps (default 0)"),
 )

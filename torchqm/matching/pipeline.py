@@ -123,6 +123,7 @@ def find_symmetry(
         known.group.maps,
         ("direct", *labels[1:]),
         torch.tensor(scores, dtype=torch.float64),
+        shape.basis.truncate(min(collection.parameters.k_max, shape.basis.k)),
         known.origin,
         [*shape.warnings, *known.warnings],
         collection.parameters.as_dict(),
@@ -132,7 +133,11 @@ def find_symmetry(
 
 
 def detect_symmetry(
-    mesh: Mesh | str | Path, *, parameters: MatchParameters | None = None, listener: StepListener | None = None
+    mesh: Mesh | str | Path,
+    *,
+    parameters: MatchParameters | None = None,
+    listener: StepListener | None = None,
+    cache_dir: str | Path | None = None,
 ) -> SymmetryResult:
     """The symmetries of a shape from its own spectrum: no reference, no mirror plane, no landmarks.
 
@@ -140,12 +145,14 @@ def detect_symmetry(
         mesh: the shape.
         parameters: of the matching.
         listener: told of each step.
+        cache_dir: folder of eigenpairs; see :func:`torchqm.matching.shape.prepare`.
 
     Returns:
-        The group, trivial if none was found; ``details`` has the verdict (``symmetric``, ``ambiguous``,
-        ``asymmetric``) and the numbers behind it, see :class:`torchqm.matching.detect.Detection`.
+        The group, trivial if none was found, with ``verdict`` (``symmetric``, ``ambiguous``, ``asymmetric``), vertex
+        maps, functional matrices (``fmaps``), even and odd functions (``symmetrized``), and in ``details`` the numbers
+        behind the verdict, see :class:`torchqm.matching.detect.Detection`.
     """
-    return find_symmetry(mesh, parameters=parameters, listener=listener, symmetry="detect")
+    return find_symmetry(mesh, parameters=parameters, listener=listener, symmetry="detect", cache_dir=cache_dir)
 
 
 class Collection:

@@ -30,11 +30,16 @@ best on all shapes; these four together had the best candidates on the harder on
 FIRST, SECOND, CHOICE = 40, 60, 100
 """Functions at which all maps, the better ones, and the best ones are compared."""
 
-CLOSE, DISTORTED = 1.35, 0.5
-"""Maps with up to this multiple of the best score are ranked by how they change distances, too, with this weight."""
+CLOSE = 1.35
+"""Maps with up to this multiple of the best score are ranked by how they change distances, too."""
 
 FEW = 40
 """Proposals from landmarks below which signs of eigenfunctions are tried, too: an egg has two tips."""
+
+LIKELY, N_LIKELY = 10.0, 8
+"""Permutations of landmarks that cost up to this multiple of the cheapest, and how many of them, have their best map
+grown to the end however it looks on the way. Where several parts of a shape are nearly symmetric each for itself (arms,
+and each leg), their permutations cost about the same, and the right one need not begin well."""
 
 SAME = 0.8
 """Correlation above which two maps are one symmetry."""
@@ -49,12 +54,14 @@ class Proposal:
         orientation: +1 if it should keep the orientation of the surface, -1 if it should turn it over.
         involution: whether it undoes itself.
         score: what speaks against it (:class:`Judge`); 0 is exact.
+        likely: the number of the permutation of landmarks that it came from, if that is one of the cheapest; else -1.
     """
 
     fmap: Float[Tensor, "K K"]
     orientation: int
     involution: bool
     score: float = float("inf")
+    likely: int = -1
 
 
 def correlation(a: Float[Tensor, "K K"], b: Float[Tensor, "K K"]) -> float:
@@ -108,7 +115,7 @@ def grown(
     return replace(proposal, fmap=fmap, score=judge.score(fmap, proposal.orientation))
 
 
-def regrown(proposal: Proposal, judge: Judge, parameters: MatchParameters, start: int = 30, times: int = 2) -> Proposal:
+def regrown(proposal: Proposal, judge: Judge, parameters: MatchParameters, start: int = 30, times: int = 4) -> Proposal:
     """The map begun anew from its first functions, as long as that makes it better.
 
     What was wrong on the way up stays in the low functions of the map; at a hundred functions they are right more often
@@ -144,23 +151,38 @@ def propose(
     second.sort(key=_by_score)
     limit = 2.5 * second[0].score if second else 0.0
     kept = [p for i, p in enumerate(different(second, most, SAME)) if i < n_kept or p.score <= limit]
+    kept += _unseen(rough, kept, judge, parameters)
     pool = sorted((grown(p, judge, parameters, CHOICE, 1000, 3000) for p in kept), key=_by_score)
     limit = 2.0 * pool[0].score if pool else 0.0
-    pool = [regrown(p, judge, parameters) if p.score <= limit or i < 3 else p for i, p in enumerate(pool)]
+    hopeful = [p.score <= limit or i < 3 or p.likely >= 0 for i, p in enumerate(pool)]
+    pool = [regrown(p, judge, parameters) if hope else p for p, hope in zip(pool, hopeful, strict=True)]
     return different(_ranked(pool, judge.x), len(pool), SAME)
 
 
+def _unseen(
+    rough: Sequence[Proposal], kept: Sequence[Proposal], judge: Judge, parameters: MatchParameters
+) -> list[Proposal]:
+    """The best map of each likely permutation that has none among those kept."""
+    first: dict[int, Proposal] = {}
+    for proposal in rough:
+        if proposal.likely >= 0 and proposal.likely not in {p.likely for p in kept}:
+            first.setdefault(proposal.likely, proposal)
+    more = [grown(p, judge, parameters, SECOND, 600, 1500) for p in first.values()]
+    return [p for p in more if all(correlation(p.fmap, k.fmap) <= SAME for k in kept)]
+
+
 def _ranked(pool: list[Proposal], x: PreparedShape) -> list[Proposal]:
-    """By score; those that are close to the best one by how much they change distances, too.
+    """By score; those that are close to the best one by the product of score and change of distances.
 
     Commutativity alone does not see that a map joins the halves of two symmetries; distances across the shape do. Of a
     person, what turns front to back can look nearly as good as what mirrors left and right.
     """
     limit = CLOSE * min((p.score for p in pool), default=0.0)
 
-    def key(proposal: Proposal) -> float:
-        more = DISTORTED * distance_change(proposal.fmap, x, x) if proposal.score <= limit else DISTORTED
-        return proposal.score * (1.3 if proposal.orientation > 0 else 1.0) + more
+    def key(proposal: Proposal) -> tuple[bool, float]:
+        score = proposal.score * (1.3 if proposal.orientation > 0 else 1.0)
+        far = proposal.score > limit
+        return far, score if far else score * distance_change(proposal.fmap, x, x)
 
     return sorted(pool, key=key)
 
@@ -175,12 +197,15 @@ def _from_landmarks(judge: Judge, n: int, k: int) -> list[Proposal]:
     values = _descriptors(x)
     found = []
     permutations = landmark_permutations(landmarks, n)
+    limit = LIKELY * min((p.cost for p in permutations), default=0.0)
+    likely = [i for i, p in enumerate(permutations) if p.cost <= limit][:N_LIKELY]
     for n_smooth, powers, weights in VARIANTS:
         maps = LandmarkMaps(x, landmarks, values, k, n_smooth, powers)
-        for permutation in permutations:
+        for i, permutation in enumerate(permutations):
+            number = i if i in likely else -1
             for chosen in weights:
                 fmap = maps.solve(permutation, *chosen)
-                found.append(Proposal(fmap, permutation.orientation, permutation.involutive))
+                found.append(Proposal(fmap, permutation.orientation, permutation.involutive, likely=number))
     return found
 
 

@@ -3,6 +3,7 @@
 import json
 import platform
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchqm.fmap.convert import p2p_to_fmap
 from torchqm.geometry.files import write_whole
+from torchqm.spectral.basis import SpectralBasis
+from torchqm.symmetry.basis import SymmetrizedBasis, symmetrized_basis
+from torchqm.symmetry.group import SymmetryGroup
 from torchqm.version import __version__
 
 __all__ = ["MatchResult", "SymmetryResult", "write_json", "write_npz"]
@@ -92,22 +97,42 @@ class SymmetryResult:
         maps: ``(|G|, V)`` int64 vertex maps, row 0 the identity.
         labels: ``direct`` or ``mirrored`` or ``unknown``, one a row.
         scores: ``(|G|,)`` commutativity defect of each map; 0 for the identity.
+        basis: the K eigenfunctions of the shape, of area 1.
         origin: where it came from: ``extrinsic``, ``detected``, ``transfer`` or ``none``.
         warnings: as in :class:`MatchResult`, and so the remaining ones.
+        details: of a detected symmetry ``verdict`` and the numbers behind it, see
+            :class:`torchqm.matching.detect.Detection`.
     """
 
     maps: Int[Tensor, "G V"]
     labels: tuple[str, ...]
     scores: Float[Tensor, " G"]
+    basis: SpectralBasis
     origin: str
     warnings: list[str] = field(default_factory=list)
     parameters: dict[str, Any] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     details: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def verdict(self) -> str:
+        """``symmetric``, ``ambiguous`` or ``asymmetric`` of a detected symmetry; else whether there is one."""
+        return str(self.details.get("verdict", "symmetric" if len(self.maps) > 1 else "asymmetric"))
+
+    @cached_property
+    def fmaps(self) -> Float[Tensor, "G K K"]:
+        """The functional matrix of each map, in ``basis``: ``f`` to ``f o maps[g]``."""
+        return torch.stack([p2p_to_fmap(p2p, self.basis, self.basis) for p2p in self.maps])
+
+    @cached_property
+    def symmetrized(self) -> SymmetrizedBasis:
+        """The even and odd functions: ``.even`` is a basis of L2+, ``.odd`` of its complement."""
+        return symmetrized_basis(self.basis, SymmetryGroup(self.maps))
+
     def save(self, path: str | Path) -> Path:
-        """Write ``maps, labels, scores`` to one ``.npz`` that loads with ``allow_pickle=False``."""
-        return write_npz(path, maps=self.maps.numpy(), labels=np.array(self.labels), scores=self.scores.numpy())
+        """Write ``maps, labels, scores, fmaps`` to one ``.npz`` that loads with ``allow_pickle=False``."""
+        arrays = {"maps": self.maps, "scores": self.scores, "fmaps": self.fmaps}
+        return write_npz(path, labels=np.array(self.labels), **{name: array.numpy() for name, array in arrays.items()})
 
     def summary(self) -> dict[str, Any]:
         """The rest, as plain values for ``summary.json``."""
