@@ -7,7 +7,7 @@ import torchqm
 from torchqm.evaluate import geodesic_errors, spread_points
 
 source = torchqm.creature("biped", 1000, pose=1, retriangulate=1)
-target = torchqm.creature("biped", 1200)
+target = torchqm.creature("biped", 1000)
 result = torchqm.match(source.mesh, target.mesh)
 
 at = spread_points(source.mesh, 50)

@@ -9,8 +9,8 @@ from torchqm.geometry import area_samples
 from torchqm.spectral import split_descriptors, unit_columns, wave_energies, wave_kernel_signature
 
 # Two poses of one creature, and the symmetry of each: here they are known exactly.
-x = torchqm.creature("quadruped", 2000, pose=1)
-y = torchqm.creature("quadruped", 2000)
+x = torchqm.creature("quadruped", 1000, pose=1)
+y = torchqm.creature("quadruped", 1000)
 group_x, group_y = torchqm.SymmetryGroup(x.base_group), torchqm.SymmetryGroup(y.base_group)
 mesh_x, mesh_y = x.mesh.normalized(), y.mesh.normalized()
 

@@ -1,5 +1,6 @@
 """What all tests share: run-time type checks, one thread, a fixed Hypothesis profile, shapes with exact answers."""
 
+import gc
 import importlib
 import os
 import sys
@@ -7,6 +8,7 @@ from pathlib import Path
 
 from jaxtyping import install_import_hook
 
+gc.disable()  # imports and collection make a million objects that stay: looking at them again takes seconds
 os.environ.pop("TORCHQM_CACHE", None)  # a developer's cache must not steer the tests
 sys.path.insert(0, str(Path(__file__).parent))  # for `references`
 # Before anything imports torchqm: annotations of its functions become checks, in the tests only.
@@ -21,6 +23,12 @@ from references import shapes  # noqa: E402
 torch.set_num_threads(1)  # sums in one order, so that equal runs give equal bits
 hypothesis.settings.register_profile("torchqm", deadline=None, derandomize=True, max_examples=20, database=None)
 hypothesis.settings.load_profile("torchqm")
+
+
+def pytest_collection_finish(session):
+    """From here on garbage is collected, among what the tests make."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,9 @@
 
 import pytest
 import torch
-from jaxtyping import TypeCheckError
+from jaxtyping import Float, TypeCheckError, jaxtyped
+from references.checker import checked
+from torch import Tensor
 
 from torchqm.geometry import inspect_mesh
 from torchqm.spectral import SpectralBasis, cluster_end
@@ -15,6 +17,20 @@ def test_annotations_are_checked(mirror_blob):
     with pytest.raises(TypeCheckError):
         SpectralBasis(torch.zeros(2), torch.zeros(5, 3), torch.zeros(5))
     assert cluster_end(torch.tensor([1.0, 2.0]), 2, rtol=0) == 2  # an int is a float
+
+
+def test_results_are_checked_against_the_sizes_of_the_arguments():
+    @jaxtyped(typechecker=checked)
+    def head(values: Float[Tensor, "V C"], n: int) -> Float[Tensor, "V"]:
+        return values[:n, 0]
+
+    assert head(torch.zeros(3, 2), 3).shape == (3,)
+    with pytest.raises(TypeCheckError, match="return value"):
+        head(torch.zeros(3, 2), 2)
+    with pytest.raises(TypeCheckError, match="parameters"):
+        head(torch.zeros(3), 2)
+    with pytest.raises(TypeCheckError, match="parameters"):
+        head(torch.zeros(3, 2), "3")
 
 
 def test_one_thread():

@@ -52,7 +52,7 @@ def test_a_reflection_known_at_landmarks_only(tmp_path, monkeypatch):
 
 
 def test_points_in_faces_and_vertices_go_together(tmp_path):
-    shapes = SyntheticShapes("synthetic:kinds=biped;poses=1;verts=500")
+    shapes = SyntheticShapes("synthetic:kinds=biped;poses=1;verts=1000")
     (name,) = shapes.names
     assert isinstance(shapes.mirrored_truth(name, name).points, SurfacePoints)
     found = measure_pair(shapes, name, name, torch.arange(shapes.mesh(name).n_verts), settings(tmp_path))

@@ -15,7 +15,7 @@ PARAMETERS = MatchParameters(k=20, k_quotient=30, k_max=40, n_samples=300, icp_s
 @pytest.fixture(scope="module")
 def pair():
     """A posed biped and its rest pose, whose plane is firm."""
-    return [prepare(creature("biped", 500, 0, pose).mesh, 40) for pose in (1, 0)]
+    return [prepare(creature("biped", 600, 0, pose).mesh, 40) for pose in (1, 0)]
 
 
 def test_a_symmetry_comes_back_from_its_file(tmp_path, pair):

@@ -17,15 +17,17 @@ from torchqm.cli.processes import Failure
 from torchqm.evaluate import report
 from torchqm.matching.baselines import MATCHERS
 
-ROOT = "synthetic:kinds=biped;verts=500;triangulation=shared"
+ROOT = "synthetic:kinds=biped;verts=600;triangulation=shared"
 DRAW = report._draw
 NAMES = ["biped-0-pose0", "biped-0-pose1", "biped-0-pose2"]
 
 
 @pytest.fixture
 def out(tmp_path, monkeypatch):
-    """The output folder; figures take most of the time and are drawn in one test only."""
+    """The output folder; figures take most of the time and are drawn in one test only, pictures are small."""
     monkeypatch.delenv("TORCHQM_CACHE", raising=False)
+    monkeypatch.setattr("torchqm.viz.charts.DPI", 60)
+    monkeypatch.setattr("torchqm.viz.render.REFINE_BELOW", 0)
     monkeypatch.setattr(report, "_draw", lambda methods, path, title: path)
     return tmp_path / "out"
 
@@ -78,11 +80,11 @@ def test_a_run_writes_everything_and_a_second_runs_nothing(out, scripted, monkey
     (picture,) = (out / "pictures").iterdir()
     assert picture.stat().st_size > 10_000
     before = results(out)
+    monkeypatch.setattr(report, "_draw", lambda methods, path, title: path)
     assert benchmark(ROOT, "--methods", "scripted", "--limit", 2, "--points", 10, out=out, worst=1) == 0
     assert "2 of 2 results are there" in capsys.readouterr().out
     assert (results(out), len(pairs())) == (before, 2)
     # one more pair, one more method: only these
-    monkeypatch.setattr(report, "_draw", lambda methods, path, title: path)
     assert benchmark(ROOT, "--methods", "scripted,descriptors", "--limit", 3, "--points", 10, out=out) == 0
     assert "2 of 6 results are there" in capsys.readouterr().out
     assert len(pairs()) == 3
@@ -261,7 +263,7 @@ def test_bad_input(tmp_path, out, scripted, capsys):
     absent, mixed = tmp_path / "absent.txt", tmp_path / "mixed.txt"
     absent.write_text(f"{NAMES[0]} {NAMES[1]}\n{NAMES[0]} biped-0-pose9\n")
     mixed.write_text("biped-0-pose0 octopus-0-pose0\n")
-    both = "synthetic:kinds=biped,octopus;verts=500"
+    both = "synthetic:kinds=biped,octopus;verts=600"
     for words, text in (
         ([tmp_path / "gone"], "gone: no such folder"),
         (["synthetic:kinds=cow"], "kinds is 'cow'"),

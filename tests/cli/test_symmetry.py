@@ -94,7 +94,9 @@ def test_from_the_spectrum_alone(files, tmp_path, capsys):
     assert float(gap.mean()) / rest.mesh.area**0.5 < 0.01
 
 
-def test_a_whole_group_goes_through_its_file_into_match(tmp_path, capsys):
+def test_a_whole_group_goes_through_its_file_into_match(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("torchqm.viz.charts.DPI", 60)
+    monkeypatch.setattr("torchqm.viz.render.REFINE_BELOW", 0)
     body = creature("ellipsoid", 1000)
     save_mesh(body.mesh, tmp_path / "egg.off")
     egg, out = str(tmp_path / "egg.off"), tmp_path / "out"

@@ -64,7 +64,7 @@ def test_a_rough_plane_is_used_and_told(lopsided):
 
 
 def test_several_planes_are_one_group():
-    body = creature("ellipsoid", 1200)
+    body = creature("ellipsoid", 1000)
     found = extrinsic_symmetry(prepare(body.mesh, 60))
     assert (found.name, found.firm, found.reflection) == ("C2 x C2 x C2", True, False)
     assert found.details["planes"] == 3
@@ -78,7 +78,7 @@ def test_several_planes_are_one_group():
 
 
 def test_a_subset_of_a_group_has_left_and_right_of_its_own():
-    shape = prepare(creature("ellipsoid", 1200).mesh, 60)
+    shape = prepare(creature("ellipsoid", 1000).mesh, 60)
     known = extrinsic_symmetry(shape)
     one = known.subset([0, 1], shape, {"why": "test"})
     assert (one.name, one.reflection, one.details["why"]) == ("C2", True, "test")
@@ -91,7 +91,7 @@ def test_a_subset_of_a_group_has_left_and_right_of_its_own():
 
 
 def test_a_given_group():
-    body = creature("ellipsoid", 1200)
+    body = creature("ellipsoid", 1000)
     shape = prepare(body.mesh, 60)
     known = given_symmetry(shape, body.base_group)
     assert (known.name, known.origin, known.warnings) == ("C2 x C2 x C2", "file", [])
@@ -113,7 +113,7 @@ def test_a_given_symmetry_has_the_halves_of_its_axis():
 
 
 def test_a_half_turn_is_a_group_and_swaps_are_no_reflections():
-    body = creature("ellipsoid", 800)
+    body = creature("ellipsoid", 1000)
     shape = prepare(body.mesh, 20)
     verts = body.mesh.verts
     turn = next(g for g in body.base_group if sum(bool((verts[:, a] * verts[g, a]).sum() < 0) for a in range(3)) == 2)

@@ -16,7 +16,7 @@ SMALL = MatchParameters(k_max=150)
 @pytest.mark.parametrize("kind", ["octopus", "ellipsoid"])
 def test_one_of_the_true_maps(kind):
     """The same triangles in another pose, and the true group of both: whichever element comes out, it is whole."""
-    source, target = creature(kind, 1200, pose=2), creature(kind, 1200)
+    source, target = creature(kind, 1000, pose=2), creature(kind, 1000)
     x, y = (prepare(c.mesh, 150) for c in (source, target))
     known_x, known_y = given_symmetry(x, source.base_group), given_symmetry(y, target.base_group)
     order = known_x.group.order
@@ -33,7 +33,7 @@ def test_one_of_the_true_maps(kind):
 
 
 def test_identity_for_a_shape_and_itself():
-    body = creature("ellipsoid", 800)
+    body = creature("ellipsoid", 1000)
     x = prepare(body.mesh, 100)
     known = given_symmetry(x, body.base_group)
     match = match_quotient(x, x, known.group, known.group, SMALL, 80)
@@ -46,7 +46,7 @@ def test_identity_for_a_shape_and_itself():
 
 
 def test_orders_must_agree():
-    body = creature("ellipsoid", 800)
+    body = creature("ellipsoid", 1000)
     x = prepare(body.mesh, 60)
     known = given_symmetry(x, body.base_group)
     match = match_quotient(x, x, known.group, known.group, SMALL)

@@ -62,7 +62,7 @@ def test_halves_of_the_true_reflection(exact):
 
 def test_halves_of_a_map_that_leaves_some_limbs_where_they_are():
     """Of the odd functions all but the lowest three are called even: left and right are told all the same."""
-    body = creature("quadruped", 1500)
+    body = creature("quadruped", 1000)
     shape = prepare(body.mesh, K)
     fmap = nearest_involution(p2p_to_fmap(body.base_group[1], shape.basis, shape.basis))
     weights, vectors = torch.linalg.eigh(fmap)

@@ -93,7 +93,7 @@ def test_one_reflection(eggs):
 
 def test_orientation_is_not_asked_of_surfaces_that_have_none():
     """What noise made of the parity of an element must not part two equal groups."""
-    body = creature("ellipsoid", 600)
+    body = creature("ellipsoid", 1000)
     x = prepare(body.mesh, 60)
     known = given_symmetry(x, body.base_group)
     pair = [known.subset([0, int((known.orientation * sign > 0).nonzero()[-1])], x, {}) for sign in (1, -1)]

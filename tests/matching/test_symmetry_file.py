@@ -158,7 +158,7 @@ def test_faults_name_the_file_and_what_is_wrong(tmp_path, shape, reflection, fau
 
 def test_a_half_turn_is_read_beside_the_identity_and_refused_alone(tmp_path):
     """Alone in a file it would be taken for a reflection, and labels would be wrong."""
-    body = creature("ellipsoid", 600)
+    body = creature("ellipsoid", 1000)
     turn = body.base_group[int((body.orientation > 0).nonzero()[1])]
     assert torch.equal(turn[turn], torch.arange(body.mesh.n_verts))
     both, alone = tmp_path / "both.npy", tmp_path / "alone.npy"

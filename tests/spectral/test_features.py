@@ -11,7 +11,7 @@ from torchqm.spectral import local_features, mesh_basis, smooth_curvature
 
 @pytest.fixture(scope="module")
 def animal():
-    body = creature("quadruped", 800)
+    body = creature("quadruped", 1000)
     mesh = body.mesh.normalized()
     return body, mesh, mesh_basis(mesh, 60)
 

@@ -108,7 +108,7 @@ def test_any_points_give_domains_that_are_images():
 
 def test_left_and_right_of_a_bent_biped():
     """Poses are not isometric: the nearest of two images cuts the body beside its middle, the domains do not."""
-    biped = creature("biped", n_verts=1500, pose=1)
+    biped = creature("biped", n_verts=1000, pose=1)
     group = SymmetryGroup(biped.base_group)
     basis = basis_of(biped.mesh, 40)
     points = basis.evecs[:, 1:] / basis.evals[1:]

@@ -110,10 +110,10 @@ def test_few_samples_are_enough_for_an_exact_plane():
 
 
 @pytest.mark.parametrize(("kind", "number"), [("biped", 1), ("ellipsoid", 3), ("octopus", 8)])
-@pytest.mark.parametrize("retriangulate", [0, 3])
+@pytest.mark.parametrize("retriangulate", [0, 1])
 def test_all_the_planes_of_a_shape(kind, number, retriangulate):
     """Exactly as many as the creature has; each gives one of its reflections."""
-    body = creature(kind, 1500, retriangulate=retriangulate)
+    body = creature(kind, 1000, retriangulate=retriangulate)
     found = find_reflections(body.mesh)
     assert len(found) == number
     assert all(plane.convincing for plane in found)
@@ -123,7 +123,6 @@ def test_all_the_planes_of_a_shape(kind, number, retriangulate):
     if not retriangulate:
         exact = {tuple(row) for row in exact_maps(body, body).nearest_vertices().tolist()}
         assert {tuple(plane.map.tolist()) for plane in found} <= exact
-    assert torch.equal(find_reflection(body.mesh).map, found[0].map)
 
 
 def test_mirror_images_of_two_planes_are_all_those_of_the_dihedral_group():
@@ -140,6 +139,7 @@ def test_mirror_images_of_two_planes_are_all_those_of_the_dihedral_group():
 
 def test_planes_generate_their_group(prism):
     planes = find_reflections(prism.mesh)
+    assert torch.equal(find_reflection(prism.mesh).map, planes[0].map)  # the first is the one
     found = extrinsic_group(prism.mesh, planes)
     assert found.group.order == 16
     assert found.residual < 1e-9

@@ -99,8 +99,8 @@ class SurfaceSearch:
             n: anchors near a vertex whose partners are tried for it.
         """
         everything, chosen = verts.numpy(), verts[anchors].numpy()
-        around = cKDTree(everything).query(chosen, k=min(m, len(everything)), workers=-1)[1]
-        close = cKDTree(chosen).query(everything, k=min(n, len(chosen)), workers=-1)[1]
+        around = cKDTree(everything).query(chosen, k=min(m, len(everything)), workers=torch.get_num_threads())[1]
+        close = cKDTree(chosen).query(everything, k=min(n, len(chosen)), workers=torch.get_num_threads())[1]
         return cls(
             anchors,
             torch.from_numpy(around.reshape(len(chosen), -1)),

@@ -178,7 +178,7 @@ def extrinsic_group(mesh: Mesh, planes: Sequence[ExtrinsicReflection], most: int
         shift = motions[a][0] @ motions[b][1] + motions[a][1]
         new = len(motions)
         motions.append((left @ right, shift))
-        distance, partner = tree.query(verts @ motions[-1][0].T + shift, workers=-1)
+        distance, partner = tree.query(verts @ motions[-1][0].T + shift, workers=torch.get_num_threads())
         maps.append(used[partner])
         residuals.append(float(np.sqrt(mass @ np.asarray(distance) ** 2 / mass.sum())) / scale)
         pairs += [(new, g) for g in range(1, new + 1)] + [(g, new) for g in range(1, new)]
@@ -245,7 +245,7 @@ def _half_sphere(n: int) -> np.ndarray:
 
 
 def _nearest(tree: cKDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    distance, index = tree.query(points, workers=-1)
+    distance, index = tree.query(points, workers=torch.get_num_threads())
     return np.asarray(distance), np.asarray(index)
 
 
