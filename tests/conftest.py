@@ -1,8 +1,10 @@
 """What all tests share: run-time type checks, one thread, a fixed Hypothesis profile, shapes with exact answers."""
 
+import functools
 import gc
 import importlib
 import os
+import pickle
 import sys
 from pathlib import Path
 
@@ -29,6 +31,35 @@ def pytest_collection_finish(session):
     """From here on garbage is collected, among what the tests make."""
     gc.freeze()
     gc.enable()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _creatures_made_once(tmp_path_factory):
+    """The meshes of the built-in creatures, seconds each, are made once in a run and shared by its processes."""
+    from torchqm.data import synthetic
+    from torchqm.geometry.files import write_whole
+
+    folder = tmp_path_factory.getbasetemp()
+    folder = (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "creatures"
+    folder.mkdir(exist_ok=True)
+
+    def shared(plain):
+        @functools.lru_cache(None)
+        @functools.wraps(plain)
+        def made(*place):
+            path = folder / "-".join(map(str, (plain.__name__, *place)))
+            if path.exists():
+                return pickle.loads(path.read_bytes())
+            value = plain(*place)
+            write_whole(path, lambda file: pickle.dump(value, file))
+            return value
+
+        return made
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("_body", "_retriangulated"):
+            patch.setattr(synthetic, name, shared(getattr(synthetic, name).__wrapped__))
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -1,3 +1,4 @@
+import inspect
 from functools import lru_cache
 
 import numpy as np
@@ -223,8 +224,8 @@ def test_wrong_arguments_are_named(options, message):
 
 def test_same_seed_same_mesh_and_other_seed_other_mesh(monkeypatch):
     a = build("quadruped", pose=2, retriangulate=1)
-    for cached in ("_body", "_retriangulated"):  # made anew; what the other tests share stays
-        monkeypatch.setattr(synthetic, cached, lru_cache(getattr(synthetic, cached).__wrapped__))
+    for shared in ("_body", "_retriangulated"):  # made anew; what the tests share may come from another process
+        monkeypatch.setattr(synthetic, shared, lru_cache(inspect.unwrap(getattr(synthetic, shared))))
     b = build("quadruped", pose=2, retriangulate=1)
     assert synthetic._body.cache_info().misses == synthetic._retriangulated.cache_info().misses == 1
     assert torch.equal(a.mesh.verts, b.mesh.verts)
