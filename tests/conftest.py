@@ -62,6 +62,29 @@ def _creatures_made_once(tmp_path_factory):
         yield
 
 
+@pytest.fixture(autouse=True)
+def _planes_found_once(monkeypatch):
+    """Matching asks for the mirror planes of a few meshes again and again, half a second each.
+
+    That they come out the same each time is tested where they are found (``tests/symmetry/test_extrinsic.py``).
+    """
+    from torchqm.matching import known
+
+    monkeypatch.setattr(known, "find_reflections", _planes)
+
+
+def _planes(mesh):
+    from torchqm.symmetry import find_reflections
+
+    key = mesh.verts.numpy().tobytes(), mesh.faces.numpy().tobytes()
+    if key not in _PLANES:
+        _PLANES[key] = find_reflections(mesh)
+    return list(_PLANES[key])
+
+
+_PLANES = {}
+
+
 @pytest.fixture(scope="session")
 def sphere():
     """Unit icosphere, 642 vertices; spectrum l (l + 1)."""

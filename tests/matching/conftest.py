@@ -1,27 +1,8 @@
-"""Shapes that the matching tests share; each is prepared once, and its mirror planes are looked for once."""
+"""Shapes that the matching tests share; each is prepared once."""
 
 import pytest
 from references import pairs
 from references.exact import Exact
-
-from torchqm.matching import known
-from torchqm.symmetry import find_reflections
-
-PLANES = {}
-"""Mirror planes of meshes with exactly these vertices and triangles. That they come out the same each time is tested
-where they are found (``tests/symmetry/test_extrinsic.py``)."""
-
-
-def planes_found_once(mesh):
-    key = mesh.verts.numpy().tobytes(), mesh.faces.numpy().tobytes()
-    if key not in PLANES:
-        PLANES[key] = find_reflections(mesh)
-    return list(PLANES[key])
-
-
-@pytest.fixture(autouse=True)
-def _planes_found_once(monkeypatch):
-    monkeypatch.setattr(known, "find_reflections", planes_found_once)
 
 
 @pytest.fixture(scope="session")

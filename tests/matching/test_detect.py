@@ -13,13 +13,15 @@ from torchqm.matching import MatchParameters, detect_group, prepare
 
 FULL = MatchParameters(k_max=100)
 GROUPS = {"biped": (2, "C2"), "quadruped": (2, "C2"), "ellipsoid": (8, "C2 x C2 x C2"), "octopus": (16, "D8")}
-VERTS = {"biped": 1000, "quadruped": 1500, "ellipsoid": 1000, "octopus": 1500}  # thin limbs need more
+POSES = {"biped": (1000, 2), "quadruped": (1500, 2), "ellipsoid": (1000, 2), "octopus": (1000, 1)}
+"""Vertices and pose."""
 
 
 @lru_cache
 def detected(kind):
     """A pose in its own triangulation, what is found on it, and where the elements of its group truly send it."""
-    body = creature(kind, VERTS[kind], 0, 2, retriangulate=1)
+    n_verts, pose = POSES[kind]
+    body = creature(kind, n_verts, 0, pose, retriangulate=1)
     shape = prepare(body.mesh, 100)
     truth = exact_maps(body, body).points(shape.mesh)
     return body, shape, detect_group(shape, FULL), truth
