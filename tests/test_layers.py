@@ -21,7 +21,7 @@ def test_layer_contract():
 
 HEAVY = (
     *("matplotlib", "gudhi", "sklearn", "skimage", "trimesh", "potpourri3d", "faiss", "robust_laplacian"),
-    *("torchmetrics", "yaml"),
+    *("torchmetrics", "yaml", "joblib", "dask", "distributed"),
 )
 
 

@@ -1,5 +1,8 @@
 """Result files: names that cannot collide, records that are taken only for what they were made from."""
 
+import os
+import time
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -51,3 +54,13 @@ def test_clean_removes_half_files_and_nothing_else(tmp_path):
     half.write_text("{")
     clean(tmp_path)
     assert [p.name for p in (tmp_path / "results" / "m").iterdir()] == ["a+b.json"]
+
+
+def test_clean_leaves_young_halves_to_those_who_may_still_write_them(tmp_path):
+    old, young = (tmp_path / "results" / "m" / f".{name}.json.xyz.part" for name in ("old", "young"))
+    old.parent.mkdir(parents=True)
+    for path, age in ((old, 4000), (young, 100)):
+        path.write_text("{")
+        os.utime(path, (time.time() - age,) * 2)
+    clean(tmp_path, 3600.0)
+    assert [p.name for p in old.parent.iterdir()] == [young.name]

@@ -1,6 +1,8 @@
 """The results of a comparison run on disk: one JSON for each pair and method, whole or not there."""
 
 import json
+import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -63,8 +65,15 @@ def read_record(path: Path, key: str) -> dict[str, Any] | None:
     return record if record["format"] == FORMAT and record["key"] == key else None
 
 
-def clean(out: Path) -> None:
-    """Remove what a killed run left half written; only while no other run writes to ``out``."""
+def clean(out: Path, age: float = 0.0) -> None:
+    """Remove what a killed run left half written; only while no other run writes to ``out``.
+
+    Args:
+        out: the folder.
+        age: seconds; what is younger stays: workers of a cluster may still end what an interrupted run gave them.
+    """
     for folder in ("results", "symmetries", "pictures"):
         for path in (out / folder).rglob(".*.part"):
-            path.unlink(missing_ok=True)
+            with suppress(FileNotFoundError):
+                if age <= 0 or time.time() - path.stat().st_mtime > age:
+                    path.unlink()

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from torchqm.benchmark.ledger import write_record
+from torchqm.benchmark.ledger import read_record, write_record
 from torchqm.benchmark.measure import Measured, measure_pair, measure_symmetry, undeformed
 from torchqm.benchmark.plan import Task, functions_of, parameters_of
 from torchqm.benchmark.symmetries import KeptCollection, match_ours
@@ -39,9 +39,15 @@ def map_path(result: Path) -> Path:
 def run_task(task: Task) -> str:
     """Do a task and write its result file, last of all files, so that its being there says that all is done.
 
+    A task whose file is there is done: a process may die between writing it and saying so. Without the file it is done
+    again.
+
     Returns:
         ``done``, ``failed`` (the file has the reason) or ``none`` (a shape whose true symmetry is not known).
     """
+    there = read_record(task.path, task.key)
+    if there is not None:
+        return str(there["status"])
     began = perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         for category in NOTED:

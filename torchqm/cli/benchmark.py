@@ -2,12 +2,16 @@
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+from torchqm.cli.backends import add_backend, check_backend
+from torchqm.cli.benchmark_help import DESCRIPTION, Help
+from torchqm.cli.cluster import connected
 from torchqm.cli.console import Progress, UserError
 from torchqm.cli.inputs import as_plain
 from torchqm.cli.processes import Failure, in_processes, usable_cores
@@ -22,60 +26,10 @@ __all__ = ["DEFAULT_METHODS", "FILES", "add_parser", "run"]
 
 DEFAULT_METHODS = "quotient,zoomout,fmap,descriptors"
 
+_RunAll = Callable[[Callable[[Any], Any], "Sequence[Task]"], Iterable[tuple[int, Any]]]
+"""Does work for tasks and gives the number and result of each as they come."""
+
 FILES = ("pairs.csv", "table.md", "worst.html", "run.json")
-
-_DESCRIPTION = """\
-Run methods on pairs of a set of shapes and compare them: a table, the error curves of the
-paper's figures, and pictures of the worst pairs. Each pair and method is a file of its own
-in OUT/results, so after a kill or an interruption the same command goes on, and more
-methods or pairs can be added later. A pair that fails is a row with its reason."""
-
-_EPILOG = """\
-methods:
-{methods}
-  published:NAME           others' results in the set's own files (SCB): {published}
-
-pairs:
-  {pairs}
-
-files written to OUT:
-  results/METHOD-DIGEST/A+B.json   one pair: numbers, error of each point, seconds, notes; the
-                  map is beside it (A+B.map.npz, p2p: target vertex of each source vertex).
-                  Results of other options or versions are in folders of their own and never
-                  mixed with these. A.json: the symmetry that a method found of a shape.
-  symmetries      symmetries found on the way, each once for all pairs
-  pairs.csv       all numbers, a row for each pair and method
-  table.md        means over the pairs
-  figure6_orbit, figure8_symmetry, figure10_map, figure_plain (.png and .svg)
-  worst.html      pictures of the worst pairs of each method
-  run.json        the command, versions and machine
-
-seconds: of the method itself, symmetries included (column seconds_symmetry: their part, which
-is spent once a shape), eigenfunctions not.
-
-exit status: 0 all pairs done, 1 some failed (the table says why), 2 wrong input,
-130 interrupted."""
-
-
-class _Help(argparse.Action):
-    """``--help`` with the names of all methods; they are in packages that load torch, so only then."""
-
-    def __init__(self, option_strings: Sequence[str], dest: str, **_: Any) -> None:
-        super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help="show this help and exit")
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        """Print the help and stop."""
-        import textwrap
-
-        from torchqm.data.pairs import PAIRS_HELP
-        from torchqm.data.published import PUBLISHED_METHODS
-        from torchqm.matching.baselines import DESCRIPTIONS
-
-        methods = "\n".join(f"  {name:24} {text}" for name, text in DESCRIPTIONS.items())
-        pairs = "\n  ".join(textwrap.wrap(PAIRS_HELP, 88))
-        parser.epilog = _EPILOG.format(methods=methods, published=", ".join(PUBLISHED_METHODS), pairs=pairs)
-        parser.print_help()
-        parser.exit()
 
 
 def add_parser(commands: Any) -> None:
@@ -83,12 +37,12 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "benchmark",
         help="compare methods on the pairs of a set of shapes",
-        description=_DESCRIPTION,
+        description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
         add_help=False,
     )
-    parser.add_argument("-h", "--help", action=_Help)
+    parser.add_argument("-h", "--help", action=Help)
     parser.add_argument(
         "root", metavar="ROOT", help="the set of shapes, see 'torchqm data check --help': a folder, or 'synthetic:'"
     )
@@ -105,7 +59,13 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("torchqm-benchmark"), metavar="DIR", help="default: %(default)s"
     )
-    parser.add_argument("--jobs", type=_count, metavar="N", help="processes of one thread each (default: all cores)")
+    parser.add_argument(
+        "--jobs",
+        type=_count,
+        metavar="N",
+        help="processes of one thread each (default: all cores); with dask: pairs at a time (default: one a worker)",
+    )
+    add_backend(parser)
     parser.add_argument(
         "--cache",
         type=Path,
@@ -137,19 +97,27 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run what is missing and write the report; 1 if a pair failed."""
+    dask = arguments.backend == "dask"
+    check_backend(arguments.backend, arguments.address)
+    if dask:  # workers are started anywhere
+        arguments.out = arguments.out.absolute()
+        if not arguments.root.startswith("synthetic:"):
+            arguments.root = str(Path(arguments.root).absolute())
     shapes, pairs, tasks, published = _plan(arguments)
-    out, jobs = arguments.out, arguments.jobs or usable_cores()
+    out = arguments.out
     with _locked(out):
         from torchqm.benchmark.ledger import clean
 
-        clean(out)
+        clean(out, 3600.0 if dask else 0.0)
         todo = [] if arguments.report else _missing(tasks, arguments.retry)
         title = f"Comparison on {arguments.root}"
         print(f"{shapes.recognised[0]}; {len(pairs)} pairs, {len(tasks) - len(todo)} of {len(tasks)} results are there")
         try:
-            with Progress() as progress:
-                _do(todo, len(tasks), jobs, progress)
-            return _report(arguments, tasks, published, title, jobs)
+            with _backend(arguments, todo) as (run_all, backend), Progress() as progress:
+                if arguments.retry:
+                    _forget(todo)
+                _do(todo, len(tasks), run_all, progress)
+            return _report(arguments, tasks, published, title, backend)
         except KeyboardInterrupt:
             left = len(_missing(todo, False))
             print(
@@ -158,6 +126,32 @@ def run(arguments: argparse.Namespace) -> int:
                 file=sys.stderr,
             )
             return 130
+
+
+@contextmanager
+def _backend(arguments: argparse.Namespace, todo: "Sequence[Task]") -> Iterator[tuple[_RunAll, dict[str, Any]]]:
+    """What runs the tasks, and what ``run.json`` says of it."""
+    if arguments.backend == "local" or not todo:
+        jobs = arguments.jobs or usable_cores()
+        yield partial(in_processes, jobs=jobs), {"name": arguments.backend, "workers": min(jobs, len(todo))}
+        return
+    root = [] if arguments.root.startswith("synthetic:") else [Path(arguments.root)]
+    with connected(arguments.address, arguments.out, root) as cluster:
+        plural = "" if cluster.most == 1 else "s"
+        print(f"Dask cluster {arguments.address}: {cluster.most} worker{plural}, one pair at a time each")
+        if cluster.threads > cluster.most:
+            print(f"  of {cluster.threads} threads one each is used; 'dask worker --nworkers N --nthreads 1' uses N")
+        about = {"name": "dask", "address": arguments.address, "workers": cluster.most}
+
+        def run_all(work: Callable[[Any], Any], tasks: "Sequence[Task]") -> Iterator[tuple[int, Any]]:
+            written = []
+            for number, result in cluster.do(work, tasks, arguments.jobs):
+                written += [] if isinstance(result, Failure) else [tasks[number].path]
+                yield number, result
+            cluster.see(written)
+            about["workers"] = cluster.most
+
+        yield run_all, about
 
 
 def _plan(
@@ -170,7 +164,7 @@ def _plan(
     from torchqm.spectral import cache_folder
 
     names = [name.strip() for name in arguments.methods.split(",") if name.strip()]
-    cache = cache_folder(arguments.cache, arguments.out / "cache")
+    cache = (cache_folder(arguments.cache) or arguments.out / "cache").absolute()
     settings = Settings(arguments.root, arguments.out, arguments.points, arguments.solver, cache)
     try:
         matchers, others = choose_methods(names)
@@ -216,7 +210,16 @@ def _missing(tasks: "Sequence[Task]", retry: bool) -> "list[Task]":
     ]
 
 
-def _do(todo: "Sequence[Task]", total: int, jobs: int, progress: Progress) -> None:
+def _forget(todo: "Sequence[Task]") -> None:
+    """Remove the results of tasks that are to be done again; from now on a result that is there is one of this run."""
+    from torchqm.benchmark.ledger import read_record
+
+    for task in todo:
+        if read_record(task.path, task.key) is not None:
+            task.path.unlink()
+
+
+def _do(todo: "Sequence[Task]", total: int, run_all: _RunAll, progress: Progress) -> None:
     """Run tasks and tell how far they are; the time left goes by the times of each method so far."""
     from torchqm.benchmark import run_task
     from torchqm.benchmark.run import fail_task
@@ -228,11 +231,11 @@ def _do(todo: "Sequence[Task]", total: int, jobs: int, progress: Progress) -> No
     spent: dict[tuple[str, str], list[float]] = {}
     progress.listener(f"{there} of {total} results", -1.0, 0.0)
     clock = perf_counter()
-    for count, (number, result) in enumerate(in_processes(run_task, todo, jobs), 1):
+    for count, (number, result) in enumerate(run_all(run_task, todo), 1):
         task, kind = todo[number], kinds[number]
         if isinstance(result, Failure):
             fail_task(task, result.reason)
-        # With several processes a result comes every `seconds / jobs`; only ratios matter for the share.
+        # With several workers a result comes every `seconds / workers`; only ratios matter for the share.
         seconds, clock = perf_counter() - clock, perf_counter()
         spent.setdefault(kind, []).append(seconds)
         left[kind] -= 1
@@ -246,7 +249,11 @@ def _do(todo: "Sequence[Task]", total: int, jobs: int, progress: Progress) -> No
 
 
 def _report(
-    arguments: argparse.Namespace, tasks: "Sequence[Task]", published: "Sequence[PublishedRows]", title: str, jobs: int
+    arguments: argparse.Namespace,
+    tasks: "Sequence[Task]",
+    published: "Sequence[PublishedRows]",
+    title: str,
+    backend: dict[str, Any],
 ) -> int:
     """Write the tables, figures and the page."""
     from torchqm.benchmark import write_page, write_summary
@@ -255,6 +262,7 @@ def _report(
     from torchqm.matching.result import write_json
 
     out = arguments.out
+    jobs = min(arguments.jobs or usable_cores(), usable_cores())
 
     def draw(pictures: "Sequence[Picture]") -> Iterator[tuple[int, Any]]:
         # A process takes seconds to start; for a few pictures this one is as quick.
@@ -269,7 +277,7 @@ def _report(
         if str(error).startswith("rows:"):
             raise UserError(f"{out}: no result is there yet") from error
         raise
-    write_json(out / "run.json", {"arguments": as_plain(arguments), **_provenance()})
+    write_json(out / "run.json", {"arguments": as_plain(arguments), "backend": backend, **_provenance()})
     print((out / "table.md").read_text("utf-8"))
     failed = sum(bool(row.get("reason")) for row in rows)
     print(f"written: {', '.join(str(out / name) for name in (*FILES, *sorted(set(files) - {'csv', 'table'})))}")

@@ -1,4 +1,8 @@
-"""The same work on many things, in processes of one thread each; one that fails or dies does not stop the others."""
+"""The same work on many things, in processes of one thread each; one that fails or dies does not stop the others.
+
+Not through joblib: its loky backend does not say which tasks were running when a process died, and its processes go on
+when the one that started them is killed.
+"""
 
 import multiprocessing
 import os
@@ -13,7 +17,7 @@ from typing import TypeVar
 
 from torchqm.cli.threads import THREAD_VARIABLES
 
-__all__ = ["Failure", "in_processes", "usable_cores"]
+__all__ = ["Failure", "attempt", "in_processes", "usable_cores"]
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -49,7 +53,7 @@ def in_processes(work: Callable[[T], R], tasks: Sequence[T], jobs: int = 1) -> I
     """
     if jobs <= 1 or len(tasks) <= 1:
         for number, task in enumerate(tasks):
-            yield number, _attempt(work, task)
+            yield number, attempt(work, task)
         return
     waiting, suspects = deque(range(len(tasks))), list[int]()
     while waiting:
@@ -58,7 +62,7 @@ def in_processes(work: Callable[[T], R], tasks: Sequence[T], jobs: int = 1) -> I
             try:
                 while waiting or running:
                     while waiting and len(running) < jobs:  # no more: then those that run when it breaks are known
-                        running[pool.submit(_attempt, work, tasks[waiting[0]])] = waiting[0]
+                        running[pool.submit(attempt, work, tasks[waiting[0]])] = waiting[0]
                         waiting.popleft()
                     for future in wait(running, return_when=FIRST_COMPLETED).done:
                         result = future.result()
@@ -72,13 +76,14 @@ def in_processes(work: Callable[[T], R], tasks: Sequence[T], jobs: int = 1) -> I
     for number in suspects:
         with _pool(1) as pool:
             try:
-                alone = pool.submit(_attempt, work, tasks[number]).result()
+                alone = pool.submit(attempt, work, tasks[number]).result()
             except BrokenProcessPool:
                 alone = Failure("its process died (out of memory, or killed)")
         yield number, alone
 
 
-def _attempt(work: Callable[[T], R], task: T) -> R | Failure:
+def attempt(work: Callable[[T], R], task: T) -> R | Failure:
+    """The result of one task, or why there is none."""
     try:
         return work(task)
     except Exception as error:  # whatever it is, it belongs to this task alone
