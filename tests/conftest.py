@@ -8,14 +8,14 @@ import pickle
 import sys
 from pathlib import Path
 
-from jaxtyping import install_import_hook
+import jaxtyping
 
 gc.disable()  # imports and collection make a million objects that stay: looking at them again takes seconds
 os.environ.pop("TORCHQM_CACHE", None)  # a developer's cache must not steer the tests
 sys.path.insert(0, str(Path(__file__).parent))  # for `references`
 # Before anything imports torchqm: annotations of its functions become checks, in the tests only.
-importlib.import_module("references.checker")
-install_import_hook("torchqm", "references.checker.checked")
+jaxtyping.jaxtyped = importlib.import_module("references.checker").jaxtyped
+jaxtyping.install_import_hook("torchqm", "references.checker.checked")
 
 import hypothesis  # noqa: E402
 import pytest  # noqa: E402

@@ -1,5 +1,7 @@
 """The suite's own set-up: annotations are checked, one thread, exact groups on the shared shapes."""
 
+from collections.abc import Iterator
+
 import pytest
 import torch
 from jaxtyping import Float, TypeCheckError, jaxtyped
@@ -19,18 +21,64 @@ def test_annotations_are_checked(mirror_blob):
     assert cluster_end(torch.tensor([1.0, 2.0]), 2, rtol=0) == 2  # an int is a float
 
 
-def test_results_are_checked_against_the_sizes_of_the_arguments():
+class TestChecker:
+    """What each function of the package is checked for; the decorator is the one that the import hook puts there."""
+
+    @staticmethod
     @jaxtyped(typechecker=checked)
-    def head(values: Float[Tensor, "V C"], n: int) -> Float[Tensor, "V"]:
+    def head(values: Float[Tensor, "V C"], n: "int" = 3, more: "Unknown | None" = None) -> 'Float[Tensor, "V"]':
         return values[:n, 0]
 
-    assert head(torch.zeros(3, 2), 3).shape == (3,)
-    with pytest.raises(TypeCheckError, match="return value"):
-        head(torch.zeros(3, 2), 2)
-    with pytest.raises(TypeCheckError, match="parameters"):
-        head(torch.zeros(3), 2)
-    with pytest.raises(TypeCheckError, match="parameters"):
-        head(torch.zeros(3, 2), "3")
+    def test_what_is_right_passes(self):
+        assert self.head(torch.zeros(3, 2)).shape == self.head(values=torch.zeros(3, 1), n=3, more=5).shape == (3,)
+
+    @pytest.mark.parametrize(
+        ("arguments", "about"),
+        [
+            ((torch.zeros(3, 2), 2), "return"),  # not the size that the argument has
+            ((torch.zeros(3),), "parameter values"),
+            ((torch.zeros(3, 2, dtype=torch.int64),), "parameter values"),
+            ((torch.zeros(3, 2), "3"), "parameter n"),  # an annotation that is a string
+        ],
+    )
+    def test_what_is_wrong_is_refused(self, arguments, about):
+        with pytest.raises(TypeCheckError, match=about):
+            self.head(*arguments)
+
+    def test_sizes_are_those_of_one_call(self):
+        """Neither those of the call before, nor those of the function that calls."""
+
+        @jaxtyped(typechecker=checked)
+        def outer(values: Float[Tensor, "V C"]) -> Float[Tensor, "V"]:
+            return self.head(torch.cat([values, values]), 6)[: len(values)]
+
+        assert outer(torch.zeros(3, 2)).shape == (3,)
+        assert outer(torch.zeros(4, 1)[:3]).shape == (3,)
+
+    def test_two_arguments_have_one_size(self):
+        @jaxtyped(typechecker=checked)
+        def add(one: Float[Tensor, " V"], other: Float[Tensor, " V"]) -> Float[Tensor, " V"]:
+            return one + other
+
+        with pytest.raises(TypeCheckError, match="parameter other"):
+            add(torch.zeros(3), torch.zeros(1))
+
+    def test_generators_are_checked_when_they_are_called(self):
+        @jaxtyped(typechecker=checked)
+        def count(n: int) -> Iterator[int]:
+            yield from range(n)
+
+        assert list(count(2)) == [0, 1]
+        with pytest.raises(TypeCheckError):
+            count("2")
+
+    def test_a_value_error_is_not_touched(self):
+        @jaxtyped(typechecker=checked)
+        def fail(n: int) -> int:
+            raise ValueError(n)
+
+        with pytest.raises(ValueError, match="3"):
+            fail(3)
 
 
 def test_one_thread():
