@@ -264,8 +264,8 @@ def _one(what: bytes) -> Any:
 
 
 def _load_and_do(what: bytes) -> Any:
-    # Not loaded by Dask, which does so where a worker hears the scheduler: one that cannot load what it is sent ends, and
-    # its nanny with it.
+    # Not loaded by Dask, which does so where a worker hears the scheduler: one that cannot load what it is sent ends,
+    # and its nanny with it.
     work, task = pickle.loads(what)
     return work(task)
 
