@@ -2,12 +2,13 @@
 
 import csv
 import json
+import pickle
 import sys
 from collections import Counter
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import dask
 import distributed
@@ -156,6 +157,15 @@ def test_a_task_that_kills_its_workers_is_a_failure_and_the_others_are_done(tmp_
     assert set(log.read_text().split()) == set("0123")
 
 
+def test_what_a_worker_cannot_load_is_a_failure(tmp_path, address, monkeypatch):
+    here = ModuleType("only_here")
+    exec("def work(task):\n    return task", vars(here))  # Dask itself would end the worker that cannot load it
+    monkeypatch.setitem(sys.modules, "only_here", here)
+    with connected(address, tmp_path) as cluster:
+        results = dict(cluster.do(here.work, ["a", "b"]))
+    assert results == dict.fromkeys(range(2), Failure("ModuleNotFoundError: No module named 'only_here'"))
+
+
 def test_of_a_worker_of_several_threads_one_is_used(tmp_path, root, scripted, capsys):
     scripted()
     with distributed.LocalCluster(
@@ -165,7 +175,8 @@ def test_of_a_worker_of_several_threads_one_is_used(tmp_path, root, scripted, ca
         text = capsys.readouterr().out
         with connected(local.scheduler_address, tmp_path) as cluster:
             together = dict(cluster.do(obey, [f"alone {tmp_path / 'mark'}"] * 4, jobs=4))
-            again = [cluster.client.submit(module._one, obey, f"alone {tmp_path / 'mark'}", pure=False) for _ in "abcd"]
+            what = pickle.dumps((obey, f"alone {tmp_path / 'mark'}"))
+            again = [cluster.client.submit(module._one, what, pure=False) for _ in range(4)]
             assert [future.result() for future in again] == [*together.values()]
     assert set(together.values()) == {f"alone {tmp_path / 'mark'} done"}
     assert "1 worker, one pair at a time each\n  of 2 threads one each is used" in text

@@ -30,7 +30,7 @@ files written to OUT:
   table.md        means over the pairs
   figure6_orbit, figure8_symmetry, figure10_map, figure_plain (.png and .svg)
   worst.html      pictures of the worst pairs of each method
-  run.json        the command, versions and machine
+  run.json        the command, where it was run, versions and machine
 
 backends: tasks are run in processes of this machine, or by --backend dask --address
 tcp://HOST:PORT on the workers of a Dask cluster (pip install 'torchqm[distributed]'), one at

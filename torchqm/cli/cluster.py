@@ -5,6 +5,7 @@ Not through joblib, as its Dask backend waits for ever once a task has killed it
 
 import logging
 import os
+import pickle
 import threading
 import time
 from collections import deque
@@ -13,7 +14,7 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 from uuid import uuid4
 
 from torchqm.cli.backends import knock
@@ -194,8 +195,9 @@ class Cluster:
             while queue and len(running) < (room if queue is waiting else min(room, 1)):
                 number = queue.popleft()
                 key = f"torchqm-{run}-{number}{'-again' if number in tried else ''}"
+                what = pickle.dumps((work, tasks[number]))
                 with self._kept():
-                    running[self.client.submit(_one, work, tasks[number], key=key, pure=False)] = number
+                    running[self.client.submit(_one, what, key=key, pure=False)] = number
             if not running:
                 time.sleep(_TICK)
                 continue
@@ -254,11 +256,18 @@ class Cluster:
 _turn = threading.Lock()
 
 
-def _one(work: Callable[[T], R], task: T) -> R | Failure:
+def _one(what: bytes) -> Any:
     """A task on a worker. In one process one at a time: warnings and caches are the process's, and become notes."""
     with _turn:
         one_thread()
-        return attempt(work, task)
+        return attempt(_load_and_do, what)
+
+
+def _load_and_do(what: bytes) -> Any:
+    # Not loaded by Dask, which does so where a worker hears the scheduler: one that cannot load what it is sent ends,
+    # and its nanny with it.
+    work, task = pickle.loads(what)
+    return work(task)
 
 
 def _look(probe: Path, needed: Sequence[Path]) -> Path | str:
