@@ -26,7 +26,7 @@ def test_own_mirror_plane_and_the_file_goes_into_match(files, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["symmetry", str(files / "blob.off"), "--out", str(out), "--no-picture", *FAST]) == 0
     with np.load(out / "symmetry.npz", allow_pickle=False) as saved:
-        assert set(saved) == {"maps", "labels", "scores"}
+        assert set(saved) == {"maps", "labels", "scores", "fmaps"}
         assert saved["maps"].tolist() == shapes.blob(2).group.maps.tolist()
         assert saved["labels"].tolist() == ["direct", "mirrored"]
         assert saved["scores"][0] == pytest.approx(0, abs=1e-9)
