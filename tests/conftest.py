@@ -1,14 +1,13 @@
 """What all tests share: run-time type checks, one thread, a fixed Hypothesis profile, shapes with exact answers."""
 
-import functools
 import gc
 import importlib
 import os
-import pickle
 import sys
 from pathlib import Path
 
 import jaxtyping
+import pytest
 
 gc.disable()  # imports and collection make a million objects that stay: looking at them again takes seconds
 os.environ.pop("TORCHQM_CACHE", None)  # a developer's cache must not steer the tests
@@ -17,14 +16,19 @@ sys.path.insert(0, str(Path(__file__).parent))  # for `references`
 jaxtyping.jaxtyped = importlib.import_module("references.checker").jaxtyped
 jaxtyping.install_import_hook("torchqm", "references.checker.checked")
 
-import hypothesis  # noqa: E402
-import pytest  # noqa: E402
-import torch  # noqa: E402
-from references import shapes  # noqa: E402
 
-torch.set_num_threads(1)  # sums in one order, so that equal runs give equal bits
-hypothesis.settings.register_profile("torchqm", deadline=None, derandomize=True, max_examples=20, database=None)
-hypothesis.settings.load_profile("torchqm")
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection(session):
+    """What takes seconds to import is not needed where tests are only given out to other processes."""
+    if session.config.getoption("dist", "no") != "no" and not hasattr(session.config, "workerinput"):
+        gc.enable()
+        return
+    import hypothesis
+    import torch
+
+    torch.set_num_threads(1)  # sums in one order, so that equal runs give equal bits
+    hypothesis.settings.register_profile("torchqm", deadline=None, derandomize=True, max_examples=20, database=None)
+    hypothesis.settings.load_profile("torchqm")
 
 
 def pytest_collection_finish(session):
@@ -34,88 +38,53 @@ def pytest_collection_finish(session):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _creatures_made_once(tmp_path_factory):
-    """The meshes of the built-in creatures, seconds each, are made once in a run and shared by its processes."""
-    from torchqm.data import synthetic
-    from torchqm.geometry.files import write_whole
+def _work_done_once(tmp_path_factory):
+    from references import once
 
     folder = tmp_path_factory.getbasetemp()
-    folder = (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "creatures"
-    folder.mkdir(exist_ok=True)
-
-    def shared(plain):
-        @functools.lru_cache(None)
-        @functools.wraps(plain)
-        def made(*place):
-            path = folder / "-".join(map(str, (plain.__name__, *place)))
-            if path.exists():
-                return pickle.loads(path.read_bytes())
-            value = plain(*place)
-            write_whole(path, lambda file: pickle.dump(value, file))
-            return value
-
-        return made
-
+    folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("_body", "_retriangulated"):
-            patch.setattr(synthetic, name, shared(getattr(synthetic, name).__wrapped__))
+        once.share(patch, folder / "creatures")
         yield
 
 
-@pytest.fixture(autouse=True)
-def _planes_found_once(monkeypatch):
-    """Matching asks for the mirror planes of a few meshes again and again, half a second each.
-
-    That they come out the same each time is tested where they are found (``tests/symmetry/test_extrinsic.py``).
-    """
-    from torchqm.matching import known
-
-    monkeypatch.setattr(known, "find_reflections", _planes)
-
-
-def _planes(mesh):
-    from torchqm.symmetry import find_reflections
-
-    key = mesh.verts.numpy().tobytes(), mesh.faces.numpy().tobytes()
-    if key not in _PLANES:
-        _PLANES[key] = find_reflections(mesh)
-    return list(_PLANES[key])
-
-
-_PLANES = {}
+@pytest.fixture(scope="session")
+def exact_shapes():
+    """The module of shapes whose answers are exact, imported when the first test needs it."""
+    return importlib.import_module("references.shapes")
 
 
 @pytest.fixture(scope="session")
-def sphere():
+def sphere(exact_shapes):
     """Unit icosphere, 642 vertices; spectrum l (l + 1)."""
-    return shapes.icosphere(3)
+    return exact_shapes.icosphere(3)
 
 
 @pytest.fixture(scope="session", params=[1, 2, 4, 8], ids=lambda order: f"group{order}")
-def blob(request):
+def blob(request, exact_shapes):
     """A bumpy ellipsoid and its exact group of 1, 2, 4 and 8 elements (642 vertices)."""
-    return shapes.blob(request.param)
+    return exact_shapes.blob(request.param)
 
 
 @pytest.fixture(scope="session")
-def mirror_blob():
+def mirror_blob(exact_shapes):
     """A bumpy ellipsoid with one exact mirror plane, x = 0."""
-    return shapes.blob(2)
+    return exact_shapes.blob(2)
 
 
 @pytest.fixture(scope="session")
-def box():
+def box(exact_shapes):
     """A cuboid with its 8 exact symmetries."""
-    return shapes.box()
+    return exact_shapes.box()
 
 
 @pytest.fixture(scope="session")
-def prism():
+def prism(exact_shapes):
     """A square prism with its 16 exact symmetries and pairs of equal eigenvalues."""
-    return shapes.prism()
+    return exact_shapes.prism()
 
 
 @pytest.fixture(scope="session")
-def rectangle():
+def rectangle(exact_shapes):
     """A flat rectangle ``[0, 1.5] x [0, 1]`` with boundary (Neumann spectrum)."""
-    return shapes.grid(24, 16, 1.5, 1.0)
+    return exact_shapes.grid(24, 16, 1.5, 1.0)
