@@ -77,7 +77,9 @@ def alive(pid):
 def test_no_process_outlives_the_one_that_started_it(tmp_path, how):
     marks = [tmp_path / "a", tmp_path / "b"]
     code = (
-        "import sys\nfrom references.work import obey\nfrom torchqm.cli.processes import in_processes\n"
+        "import signal, sys\nfrom references.work import obey\nfrom torchqm.cli.processes import in_processes\n"
+        # A shell's background jobs, and what they start, ignore Ctrl-C.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "if __name__ == '__main__':\n    list(in_processes(obey, [f'hang {mark}' for mark in sys.argv[1:]], 2))\n"
     )
     tests = os.path.dirname(os.path.dirname(__file__))
