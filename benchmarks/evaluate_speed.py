@@ -29,7 +29,6 @@ BOUND_SECONDS = 90.0
 
 def one(task: tuple[str, str, str, Path]) -> tuple[int, float]:
     """Vertices of a shape, and the mean error of the wrong map to it."""
-    torch.set_num_threads(1)
     root, first, second, cache = task
     shapes = open_shapes(root)
     mesh = shapes.mesh(second)

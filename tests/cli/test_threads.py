@@ -5,7 +5,7 @@ import os
 import torch
 from threadpoolctl import threadpool_info
 
-from torchqm.cli.threads import THREAD_VARIABLES, one_thread
+from torchqm.cli.threads import THREAD_VARIABLES, limit_to_one_thread
 
 
 def test_one_thread(monkeypatch):
@@ -13,7 +13,7 @@ def test_one_thread(monkeypatch):
         monkeypatch.setenv(name, "8")
     torch.set_num_threads(2)
     try:
-        one_thread()
+        limit_to_one_thread()
         assert torch.get_num_threads() == 1
     finally:
         torch.set_num_threads(1)  # as conftest has it

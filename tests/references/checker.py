@@ -56,5 +56,5 @@ def _resolved(hint: Any, names: dict[str, Any]) -> Any:
     of.__annotations__ = {"value": hint}
     try:
         return typing.get_type_hints(of, names, include_extras=True)["value"]
-    except Exception:  # as in jaxtyping: names of a module that only type checkers import, or of a class to come
+    except NameError:  # as in jaxtyping: of a module that only type checkers import, or of a class to come
         return Any

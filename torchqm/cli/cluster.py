@@ -20,7 +20,7 @@ from uuid import uuid4
 from torchqm.cli.backends import knock
 from torchqm.cli.console import UserError
 from torchqm.cli.processes import Failure, attempt
-from torchqm.cli.threads import one_thread
+from torchqm.cli.threads import limit_to_one_thread
 from torchqm.version import __version__
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def connected(address: str, folder: Path, needed: Sequence[Path] = ()) -> "Itera
     log.setLevel(logging.CRITICAL)  # what it has to say becomes an error in one line
     try:
         client = Client(address, timeout=CONNECT, set_as_default=False, name="torchqm")
-    except Exception as error:  # certificates, versions, and whatever else two programs can disagree on
+    except (OSError, RuntimeError, TypeError, ValueError) as error:  # no answer, versions, certificates
         raise UserError(f"{address}: no connection to the Dask scheduler ({type(error).__name__}: {error})") from error
     probe = folder / f".probe-{uuid4().hex}"
     try:
@@ -259,7 +259,7 @@ _turn = threading.Lock()
 def _one(what: bytes) -> Any:
     """A task on a worker. In one process one at a time: warnings and caches are the process's, and become notes."""
     with _turn:
-        one_thread()
+        limit_to_one_thread()
         return attempt(_load_and_do, what)
 
 

@@ -15,7 +15,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import TypeVar
 
-from torchqm.cli.threads import THREAD_VARIABLES
+from torchqm.cli.threads import limit_to_one_thread
 
 __all__ = ["Failure", "attempt", "in_processes", "usable_cores"]
 
@@ -98,8 +98,7 @@ def _pool(n: int) -> ProcessPoolExecutor:
 
 def _begin() -> None:
     """Before anything heavy is imported: one thread, and an end as soon as the parent ends, however it does."""
-    for name in THREAD_VARIABLES:
-        os.environ[name] = "1"
+    limit_to_one_thread()
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback from each process on Ctrl-C
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

@@ -33,8 +33,8 @@ reference, another pose of the same shape (section 6.1 of the paper)."""
 _EPILOG = """\
 files written to DIR (whole or not at all):
   symmetry.npz  maps (G, V) image of each vertex, row 0 the identity; labels; scores (0 for an
-                isometry). `torchqm match --symmetry` reads it. If no symmetry was found there
-                is row 0 alone, and a warning that says why.
+                isometry); fmaps (G, K, K) functional matrices. `torchqm match --symmetry` reads
+                it. If no symmetry was found there is row 0 alone, and a warning that says why.
   summary.json  where the symmetry came from, residuals, parameters, warnings, seconds per step
   symmetry.png  the shape's XYZ as RGB, those of each point's image, and how far it moves"""
 

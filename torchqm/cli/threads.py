@@ -4,7 +4,7 @@ import argparse
 import os
 import sys
 
-__all__ = ["THREAD_VARIABLES", "add_threads", "one_thread", "set_threads"]
+__all__ = ["THREAD_VARIABLES", "add_threads", "limit_to_one_thread", "set_threads"]
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """What the numerical libraries read when they are loaded."""
@@ -33,7 +33,7 @@ def set_threads(given: int | None, default: int | None) -> None:
             os.environ.setdefault(name, str(default))
 
 
-def one_thread() -> None:
+def limit_to_one_thread() -> None:
     """One thread from now on, for libraries that are loaded already (in the calling thread) and for those to come."""
     from threadpoolctl import threadpool_limits
 

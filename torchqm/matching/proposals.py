@@ -162,10 +162,10 @@ def propose(
 def _unseen(
     rough: Sequence[Proposal], kept: Sequence[Proposal], judge: Judge, parameters: MatchParameters
 ) -> list[Proposal]:
-    """The best map of each likely permutation that has none among those kept."""
-    first: dict[int, Proposal] = {}
+    """The best map of each likely permutation that has none among those kept; ``rough`` has the best first."""
+    seen, first = {p.likely for p in kept}, dict[int, Proposal]()
     for proposal in rough:
-        if proposal.likely >= 0 and proposal.likely not in {p.likely for p in kept}:
+        if proposal.likely >= 0 and proposal.likely not in seen:
             first.setdefault(proposal.likely, proposal)
     more = [grown(p, judge, parameters, SECOND, 600, 1500) for p in first.values()]
     return [p for p in more if all(correlation(p.fmap, k.fmap) <= SAME for k in kept)]

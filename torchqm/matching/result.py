@@ -115,9 +115,9 @@ class SymmetryResult:
     details: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def verdict(self) -> str:
-        """``symmetric``, ``ambiguous`` or ``asymmetric`` of a detected symmetry; else whether there is one."""
-        return str(self.details.get("verdict", "symmetric" if len(self.maps) > 1 else "asymmetric"))
+    def verdict(self) -> str | None:
+        """``symmetric``, ``ambiguous`` or ``asymmetric``; None if the spectrum was not asked, which alone can tell."""
+        return self.details.get("verdict")
 
     @cached_property
     def fmaps(self) -> Float[Tensor, "G K K"]:
