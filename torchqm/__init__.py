@@ -91,7 +91,9 @@ _HOMES = {
     "torchqm.symmetry": ("SymmetrizedBasis", "SymmetryGroup", "even_part", "odd_part", "symmetrized_basis"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
-_SUBPACKAGES = ("data", "evaluate", "fmap", "geometry", "matching", "spectral", "symmetry", "testing", "viz")
+_SUBPACKAGES = (
+    *("checks", "data", "evaluate", "fmap", "geometry", "matching", "nn", "spectral", "symmetry", "testing", "viz"),
+)
 
 
 def __getattr__(name: str) -> Any:

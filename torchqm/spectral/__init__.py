@@ -20,11 +20,13 @@ from torchqm.spectral.descriptors import (
 )
 from torchqm.spectral.eigen import SpectrumError, eigenbasis, fix_signs, mesh_basis, relative_residuals
 from torchqm.spectral.features import local_features, smooth_curvature
+from torchqm.spectral.soft_map import SoftMap, soft_fmap
 
 __all__ = [
     "CacheReport",
     "CacheWarning",
     "CachedBasis",
+    "SoftMap",
     "SpectralBasis",
     "SpectrumError",
     "WaveEnergies",
@@ -40,6 +42,7 @@ __all__ = [
     "read_basis",
     "relative_residuals",
     "smooth_curvature",
+    "soft_fmap",
     "split_descriptors",
     "unit_columns",
     "wave_energies",

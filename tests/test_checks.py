@@ -1,0 +1,64 @@
+import pytest
+import torch
+
+from torchqm import checks
+
+
+def test_letters_are_learned_and_compared():
+    sizes = checks.Sizes()
+    sizes.bind("evecs", torch.zeros(4, 2, 50, 10), "... V K")
+    assert (sizes["V"], sizes["K"], sizes.leading) == (50, 10, (4, 2))
+    sizes.bind("mass", torch.zeros(4, 2, 50), "... V")
+    with pytest.raises(
+        ValueError, match=r"evals: shape \(4, 2, 9\) given, expected \(4, 2, K\) with K = 10 as in evecs"
+    ):
+        sizes.bind("evals", torch.zeros(4, 2, 9), "... K")
+    with pytest.raises(ValueError, match=r"mass: shape \(3, 50\) given, expected \(4, 2, V\) with V = 50 as in evecs"):
+        sizes.bind("mass", torch.zeros(3, 50), "... V")
+    with pytest.raises(ValueError, match=r"verts: shape \(50, 2\) given, expected \(V, 3\) with V = 50 as in evecs"):
+        sizes.bind("verts", torch.zeros(50, 2), "V 3")
+    with pytest.raises(ValueError, match=r"evals: shape \(\) given, expected \(..., K\)"):
+        sizes.bind("evals", torch.zeros(()), "... K")
+    with pytest.raises(TypeError, match="faces: expected a tensor, got list"):
+        sizes.bind("faces", [1, 2], "F 3")
+
+
+def test_a_wrong_argument_teaches_nothing():
+    sizes = checks.Sizes()
+    with pytest.raises(ValueError, match="verts"):
+        sizes.bind("verts", torch.zeros(50, 2), "V 3")
+    sizes.bind("verts", torch.zeros(40, 3), "V 3")
+    assert sizes["V"] == 40
+
+
+def test_values():
+    with pytest.raises(ValueError, match=r"feat: 2 of 6 entries are NaN or infinite, the first at \(0, 1\)"):
+        checks.require_finite("feat", torch.tensor([[0.0, torch.nan, 1.0], [torch.inf, 0.0, 0.0]]))
+    with pytest.raises(ValueError, match=r"mass: 1 of 2 entries are negative, the first at \(1,\) is -0.5"):
+        checks.require_nonnegative("mass", torch.tensor([1.0, -0.5]))
+    with pytest.raises(ValueError, match="mass: 1 of 1 entries are NaN"):
+        checks.require_nonnegative("mass", torch.tensor([torch.nan]))
+    with pytest.raises(ValueError, match=r"verts_mask: no true element in row\(s\) \[1\]"):
+        checks.require_mask("verts_mask", torch.tensor([[True, False], [False, False]]))
+    with pytest.raises(ValueError, match=r"verts_mask: dtype torch\.int64 given"):
+        checks.require_mask("verts_mask", torch.ones(2, 2, dtype=torch.int64))
+
+
+def test_values_are_not_looked_at_where_they_are_unknown_or_not_wanted():
+    bad = torch.tensor([torch.nan])
+    with checks.disabled():
+        checks.require_finite("feat", bad)
+        checks.require_mask("mask", torch.zeros(1, dtype=torch.bool))
+    with pytest.raises(ValueError, match="feat"):
+        checks.require_finite("feat", bad)
+    checks.set_enabled(False)
+    try:
+        checks.require_nonnegative("mass", -torch.ones(1))
+    finally:
+        checks.set_enabled(True)
+
+    def looked_at(row):
+        checks.require_finite("row", row)
+        return row * 2
+
+    assert torch.func.vmap(looked_at)(bad.expand(3, 1)).shape == (3, 1)
