@@ -8,11 +8,11 @@ from torchqm.fmap.energy import (
     orthogonality_energy,
 )
 from torchqm.fmap.nearest import SurfaceSearch, nearest_rows
+from torchqm.fmap.polar import nearest_isometry
 from torchqm.fmap.refine import (
     correspondence_fmap,
     frequency_mask,
     growing_sizes,
-    nearest_isometry,
     quotient_icp,
     semi_quotient_icp,
     semi_upsample,

@@ -7,13 +7,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.fmap.convert import deltas, nearest_used
+from torchqm.fmap.polar import nearest_isometry
 from torchqm.spectral.basis import SpectralBasis
 
 __all__ = [
     "correspondence_fmap",
     "frequency_mask",
     "growing_sizes",
-    "nearest_isometry",
     "quotient_icp",
     "semi_quotient_icp",
     "semi_upsample",
@@ -21,16 +21,6 @@ __all__ = [
 ]
 
 FMap = Float[Tensor, "Ky Kx"]
-
-
-def nearest_isometry(matrix: FMap) -> FMap:
-    """Replace all singular values by one: ``U S V^T -> U V^T``, the isometry (or co-isometry) nearest to the matrix.
-
-    A square matrix becomes orthogonal. Of a wide one (semi-quotient) the rows become orthonormal: the map is an
-    isometry on the complement of its kernel (paper, Lemma 5.1 iii).
-    """
-    left, _, right = torch.linalg.svd(matrix, full_matrices=False)
-    return left @ right
 
 
 def frequency_mask(evals_x: Float[Tensor, " Kx"], evals_y: Float[Tensor, " Ky"], width: float = 0.2) -> FMap:

@@ -1,3 +1,5 @@
-"""Floor 6: layers that drop into a learned pipeline; each holds options and calls one function of a lower floor."""
+"""Floor 6: layers that drop into a learned pipeline; each holds options and calls functions of the lower floors."""
 
-__all__: list[str] = []
+from torchqm.nn.descriptors import HeatKernelSignature, OrientationDescriptors, WaveKernelSignature
+
+__all__ = ["HeatKernelSignature", "OrientationDescriptors", "WaveKernelSignature"]

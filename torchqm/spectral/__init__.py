@@ -12,11 +12,13 @@ from torchqm.spectral.cache import (
 from torchqm.spectral.descriptors import (
     WaveEnergies,
     heat_kernel_signature,
+    heat_kernel_values,
     heat_times,
     split_descriptors,
     unit_columns,
     wave_energies,
     wave_kernel_signature,
+    wave_kernel_values,
 )
 from torchqm.spectral.eigen import SpectrumError, eigenbasis, fix_signs, mesh_basis, relative_residuals
 from torchqm.spectral.features import local_features, smooth_curvature
@@ -36,6 +38,7 @@ __all__ = [
     "eigenbasis",
     "fix_signs",
     "heat_kernel_signature",
+    "heat_kernel_values",
     "heat_times",
     "local_features",
     "mesh_basis",
@@ -47,4 +50,5 @@ __all__ = [
     "unit_columns",
     "wave_energies",
     "wave_kernel_signature",
+    "wave_kernel_values",
 ]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from math import log
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchqm.spectral.basis import SpectralBasis
@@ -13,11 +13,13 @@ from torchqm.spectral.basis import SpectralBasis
 __all__ = [
     "WaveEnergies",
     "heat_kernel_signature",
+    "heat_kernel_values",
     "heat_times",
     "split_descriptors",
     "unit_columns",
     "wave_energies",
     "wave_kernel_signature",
+    "wave_kernel_values",
 ]
 
 Values = Float[Tensor, "_V C"]  # the shapes of a list may have different numbers of vertices
@@ -63,9 +65,31 @@ def wave_kernel_signature(basis: SpectralBasis, energies: WaveEnergies) -> Float
     References:
         Aubry, Schlickewei and Cremers 2011; paper, section 4.1 and 7.4.
     """
-    logs = basis.evals[1:].clamp_min(_tiny(basis.evals)).log()
-    weights = torch.softmax(-((energies.log_energies[None] - logs[:, None]) ** 2) / (2 * energies.sigma**2), dim=0)
-    return basis.evecs[:, 1:].square() @ weights.to(basis.evecs.dtype)
+    return wave_kernel_values(basis.evals, basis.evecs, energies.log_energies, energies.sigma)
+
+
+def wave_kernel_values(
+    evals: Float[Tensor, "*B K"],
+    evecs: Float[Tensor, "*B V K"],
+    log_energies: Float[Tensor, " n"],
+    sigma: float | Float[Tensor, " n"],
+    evals_mask: Bool[Tensor, "*B K"] | None = None,
+) -> Float[Tensor, "*B V n"]:
+    """:func:`wave_kernel_signature` of a batch, differentiable in all that it is given.
+
+    Args:
+        evals: ``(..., K)`` ascending; the first function, the constant one, is left out.
+        evecs: ``(..., V, K)``.
+        log_energies: ``(n,)`` natural logarithms of eigenvalues.
+        sigma: width of the band-pass, one for all energies or one each (logarithmic unit).
+        evals_mask: ``(..., K)`` true where a function is real, not padding.
+    """
+    logs = evals[..., 1:].clamp_min(_tiny(evals)).log()
+    width = torch.as_tensor(sigma, dtype=log_energies.dtype, device=log_energies.device)
+    scores = -((log_energies - logs[..., :, None]) ** 2) / (2 * width**2)
+    if evals_mask is not None:
+        scores = scores.masked_fill(~evals_mask[..., 1:, None], -torch.inf)
+    return evecs[..., 1:].square() @ torch.softmax(scores, dim=-2).to(evecs.dtype)
 
 
 def heat_times(bases: Sequence[SpectralBasis], n: int = 100) -> Float[Tensor, " n"]:
@@ -99,8 +123,27 @@ def heat_kernel_signature(basis: SpectralBasis, times: Float[Tensor, " n"]) -> F
     References:
         Sun, Ovsjanikov and Guibas 2009; paper, section 2.
     """
-    decay = torch.exp(-basis.evals[:, None] * times[None])
-    return basis.evecs.square() @ (decay / decay.sum(0)).to(basis.evecs.dtype)
+    return heat_kernel_values(basis.evals, basis.evecs, times)
+
+
+def heat_kernel_values(
+    evals: Float[Tensor, "*B K"],
+    evecs: Float[Tensor, "*B V K"],
+    times: Float[Tensor, " n"],
+    evals_mask: Bool[Tensor, "*B K"] | None = None,
+) -> Float[Tensor, "*B V n"]:
+    """:func:`heat_kernel_signature` of a batch, differentiable in all that it is given.
+
+    Args:
+        evals: ``(..., K)``.
+        evecs: ``(..., V, K)``.
+        times: ``(n,)`` diffusion times (1 / unit of ``evals``).
+        evals_mask: ``(..., K)`` true where a function is real, not padding.
+    """
+    decay = torch.exp(-evals[..., :, None] * times)
+    if evals_mask is not None:
+        decay = decay.masked_fill(~evals_mask[..., :, None], 0.0)
+    return evecs.square() @ (decay / decay.sum(-2, keepdim=True)).to(evecs.dtype)
 
 
 def split_descriptors(values: Sequence[Values], s: int = 5) -> list[Float[Tensor, "_V sC"]]:

@@ -26,6 +26,7 @@ from torchqm.symmetry.orientation import (
     function_pairs,
     orientation_coefficients,
     orientation_cosine,
+    orientation_descriptors,
     orientation_form,
     orientation_tensor,
 )
@@ -58,6 +59,7 @@ __all__ = [
     "odd_part",
     "orientation_coefficients",
     "orientation_cosine",
+    "orientation_descriptors",
     "orientation_form",
     "orientation_tensor",
     "persistence_clusters",

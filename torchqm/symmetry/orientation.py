@@ -14,9 +14,11 @@ from torchqm.geometry.mesh import Mesh
 from torchqm.spectral.basis import SpectralBasis
 
 __all__ = [
+    "face_form",
     "function_pairs",
     "orientation_coefficients",
     "orientation_cosine",
+    "orientation_descriptors",
     "orientation_form",
     "orientation_tensor",
 ]
@@ -48,10 +50,54 @@ def orientation_form(mesh: Mesh, values: Float[Tensor, "V C"], pairs: Int[Tensor
         >>> orientation_form(triangle, triangle.verts[:, :2], torch.tensor([[0], [1]])).item()
         0.5
     """
-    corners = values[mesh.faces]
-    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return face_form(values, mesh.faces, pairs)
+
+
+def face_form(
+    values: Float[Tensor, "*B V C"], faces: Int[Tensor, "*B F 3"], pairs: Int[Tensor, "2 P"]
+) -> Float[Tensor, "*B F P"]:
+    """:func:`orientation_form` of a batch; a triangle without area, as ``0 0 0`` in padding, gives zero.
+
+    Args:
+        values: ``(..., V, C)`` vertex values.
+        faces: ``(..., F, 3)`` consistently oriented triangles.
+        pairs: ``(2, P)`` which functions to pair, for all of the batch.
+    """
+    ids = faces.flatten(-2)[..., None].expand(*faces.shape[:-2], -1, values.shape[-1])
+    corners = values[faces] if faces.ndim == 2 else torch.gather(values, -2, ids).unflatten(-2, (-1, 3))
+    u = corners[..., 1, :] - corners[..., 0, :]
+    v = corners[..., 2, :] - corners[..., 0, :]
     a, b = pairs
-    return (u[:, a] * v[:, b] - v[:, a] * u[:, b]) / 2
+    return (u[..., a] * v[..., b] - v[..., a] * u[..., b]) / 2
+
+
+def orientation_descriptors(
+    values: Float[Tensor, "*B V C"],
+    faces: Int[Tensor, "*B F 3"],
+    mass: Float[Tensor, "*B V"],
+    pairs: Int[Tensor, "2 P"],
+) -> Float[Tensor, "*B V P"]:
+    """``omega(f_a, f_b) = n . (grad f_a x grad f_b)`` at each vertex: odd functions, where the f are even.
+
+    The mean over the triangles around a vertex, weighted by a third of their area, so that its coefficients in a basis
+    are the integrals of :func:`orientation_coefficients`. Bilinear in f, differentiable.
+
+    Args:
+        values: ``(..., V, C)`` vertex values of C functions.
+        faces: ``(..., F, 3)`` consistently oriented triangles.
+        mass: ``(..., V)`` lumped vertex areas (a third of the triangles around each); zero where there is none.
+        pairs: ``(2, P)`` which functions to pair.
+
+    Returns:
+        ``(..., V, P)`` in (unit of f)^2 / area; zero where a vertex has no mass.
+    """
+    form = face_form(values, faces, pairs) / 3
+    total = values.new_zeros(*values.shape[:-1], form.shape[-1])
+    for corner in range(3):
+        ids = faces[..., corner, None].expand_as(form)
+        total = total.scatter_add(-2, ids, form)
+    used = mass > 0
+    return torch.where(used[..., None], total / torch.where(used, mass, 1.0)[..., None], 0.0)
 
 
 def orientation_coefficients(
