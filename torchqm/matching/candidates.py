@@ -1,7 +1,8 @@
-"""Two ways from the first even block to the full map, and the choice between what they give."""
+"""The ways from the first even block to the full map, and the choice between what they give."""
 
 from dataclasses import dataclass, replace
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -14,12 +15,16 @@ from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.quality import commutator_norm, distance_change
 from torchqm.matching.quotient import QuotientMatch, pair_places, refine_fmap
 from torchqm.matching.shape import PreparedShape
+from torchqm.matching.synchronize import synchronized_halves
 from torchqm.symmetry.basis import SymmetrizedBasis, symmetrized_basis
 
 __all__ = ["FullMap", "full_map_from_blocks", "sharpened"]
 
 K_CHOICE = 100
 """Functions at which candidates are compared."""
+
+AGREEMENT = 0.9
+"""Share of the shape, weighted by the distance of mirror images, on which odd block and neighbours must agree."""
 
 FIRST_STEPS = 3
 """Two-way steps at the first size: more of them spread errors of the first map, instead of mending them."""
@@ -35,12 +40,15 @@ class FullMap:
         odd: the odd block, with its two residuals.
         scores: of each candidate, at :data:`K_CHOICE` functions: commutator with the Laplacian times change of
             distances; 0 is exact.
+        synchronized: whether the odd block was given up for :mod:`torchqm.matching.synchronize`; then which of the two
+            maps this is, direct or mirrored, is not known from the blocks.
     """
 
     fmap: Float[Tensor, "K K"]
     quotient: QuotientMatch
     odd: OddMap
     scores: tuple[float, ...]
+    synchronized: bool = False
 
 
 def full_map_from_blocks(
@@ -51,11 +59,12 @@ def full_map_from_blocks(
     known_y: KnownSymmetry,
     parameters: MatchParameters,
 ) -> FullMap:
-    """The odd block from orientation, joined with the even one; the full map refined. Two candidates, the better kept.
+    """The odd block from orientation, joined with the even one; the full map refined. The best candidate is kept.
 
     One candidate is the even block as quotient ICP leaves it. The other is grown in the quotient first
     (:func:`sharpened`): better where few functions do not fix the map, worse where the two symmetries differ a little.
-    Both are grown to a hundred functions. The commutator alone prefers smooth maps that stretch a limb, distances alone
+    Where neighbours contradict the odd block (:func:`_synchronized`), the map without it is a candidate, too.
+    All are grown to a hundred functions. The commutator alone prefers smooth maps that stretch a limb, distances alone
     prefer rough ones; their product chose rightly on nearly all pairs of TOSCA's tuning classes.
 
     Args:
@@ -77,6 +86,8 @@ def full_map_from_blocks(
         )
         fmap = join_blocks(block.source, block.target, block.fmap, odd.fmap)
         found.append(FullMap(fmap, block, odd, ()))
+    if places is not None:
+        found += [more for one in found if (more := _synchronized(one, x, y, known_x, known_y)) is not None]
     if places is None or len(found) == 1:
         return replace(found[0], fmap=refine_fmap(found[0].fmap, x, y, parameters, places))
     few = places[0].fewer(1000, 3000), places[1].fewer(1000, 3000)
@@ -90,6 +101,21 @@ def full_map_from_blocks(
 def _score(fmap: Float[Tensor, "K K"], x: PreparedShape, y: PreparedShape) -> float:
     k_y, k_x = fmap.shape
     return commutator_norm(fmap, x.basis.evals[:k_x], y.basis.evals[:k_y]) * distance_change(fmap, x, y)
+
+
+def _synchronized(
+    full: FullMap, x: PreparedShape, y: PreparedShape, known_x: KnownSymmetry, known_y: KnownSymmetry
+) -> FullMap | None:
+    """The map whose halves are chosen by neighbours, if the odd block chose otherwise on a tenth of the shape."""
+    halves = synchronized_halves(full.quotient, x, y, known_x, known_y)
+    source, target = full.quotient.source.full, full.quotient.target.full
+    at_x = source.evecs[halves.samples]
+    both = torch.stack([halves.images, known_y.group.maps[1][halves.images]])
+    gaps = (target.evecs[both] - at_x @ full.fmap.T).square().sum(2)
+    if halves.agreement(both.gather(0, gaps.argmin(0)[None])[0]) > AGREEMENT:
+        return None
+    fmap = nearest_isometry(target.evecs[halves.images].T @ at_x)
+    return replace(full, fmap=fmap, synchronized=True)
 
 
 def sharpened(

@@ -93,7 +93,8 @@ def match_prepared(
                 fmap, odd, even = full.fmap, full.odd, full.quotient.fmap
                 details |= {"residual_direct": odd.residual_direct, "residual_mirrored": odd.residual_mirrored}
                 details |= {"candidate_scores": list(full.scores)}
-                separated = odd.separated
+                details |= {"synchronized": full.synchronized}
+                separated = None if full.synchronized else odd.separated
             else:
                 halves = choose_halves(found.orbit_map(x, y), known_y.group, known_x.sign, known_y.sign)
                 if parameters.refinement == "icp":
