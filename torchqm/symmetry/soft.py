@@ -4,12 +4,14 @@ A symmetry is a table of vertex maps, functional matrices, or a soft self-map th
 ``P = mean_g Phi^T A Pi_g Phi``, a ``(..., K, K)`` matrix; :mod:`torchqm.symmetry.split` makes bases of it.
 """
 
+from typing import Any
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchqm.checks import Sizes, enabled, require_finite, require_mask, require_nonnegative
-from torchqm.spectral.soft_map import SoftMap, soft_fmap
+from torchqm.spectral.soft_map import SoftMap
 
 __all__ = ["projection_matrices"]
 
@@ -75,9 +77,11 @@ def project(
 ) -> Tensor:
     """:func:`projection_matrices` of arguments that are checked and free of padding."""
     if group is not None:
-        return _group_projection(evecs, mass, group.long(), group_mask)
+        count = group.shape[-2] if group_mask is None else group_mask.sum(-1)[..., None, None]
+        return _inner_products(evecs, _sum_over_maps(evecs, group.long(), group_mask), mass) / count
     if soft_map is not None:
-        fmaps = soft_fmap(soft_map, evecs, (evecs * mass[..., None]).mT)
+        pulled = soft_map.apply(evecs) if isinstance(soft_map, SoftMap) else soft_map @ evecs
+        fmaps = _inner_products(evecs, pulled, mass)
     elif fmaps is None:
         raise ValueError("no symmetry is given")
     if fmaps.ndim > evecs.ndim:
@@ -186,16 +190,48 @@ def _shares(mask: Tensor | None, fmaps: Tensor) -> Tensor:
     return mask.to(fmaps.dtype) / mask.sum(-1, keepdim=True)
 
 
-def _group_projection(evecs: Tensor, mass: Tensor, group: Tensor, mask: Tensor | None) -> Tensor:
-    """One gather of rows for each element but the identity, all on one flat table: the quick path of gather on CPUs."""
-    n, k = evecs.shape[-2:]
+def _sum_over_maps(evecs: Tensor, group: Tensor, mask: Tensor | None) -> Tensor:
+    """``sum_g Phi[g]``: one gather of rows for each element but the identity, on one flat table (quicker on CPUs)."""
+    *front, n, k = evecs.shape
     table = evecs.reshape(-1, k)
-    offsets = torch.arange(table.shape[0] // n, device=group.device).reshape(*evecs.shape[:-2], 1) * n
-    total, order = evecs, group.shape[-2]
-    for g in range(1, order):
-        moved = table.index_select(0, (group[..., g, :] + offsets).reshape(-1)).reshape(evecs.shape)
+    offsets = torch.arange(table.shape[0] // n, device=group.device).reshape(*front, 1) * n
+    total = table
+    for g in range(1, group.shape[-2]):
+        moved = table.index_select(0, (group[..., g, :] + offsets).reshape(-1))
         if mask is not None:
-            moved = moved * mask[..., g, None, None]
+            moved = moved * mask[..., g, None].expand(*front, n).reshape(-1, 1)
         total = moved.add_(total)  # `moved` is ours: no further (V, K) tensor is made
-    count = order if mask is None else mask.sum(-1)[..., None, None]
-    return (evecs * mass[..., None]).mT @ total / count
+    return total.reshape(evecs.shape)
+
+
+def _inner_products(f: Tensor, g: Tensor, mass: Tensor) -> Tensor:
+    """``F^T diag(mass) G`` of functions as columns."""
+    product: Tensor = _InnerProducts.apply(f, g, mass)
+    return product
+
+
+class _InnerProducts(torch.autograd.Function):
+    """Autograd's own would keep ``diag(mass) F`` and make gradients transposed, which costs copies of (V, K)."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(f: Tensor, g: Tensor, mass: Tensor) -> Tensor:
+        return (f * mass[..., None]).mT @ g
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        f, g, mass = ctx.saved_tensors
+        (grad,) = grads
+        grad_f = grad_g = grad_mass = None
+        if ctx.needs_input_grad[0] or ctx.needs_input_grad[2]:
+            pulled = g @ grad.mT
+            grad_mass = (f * pulled).sum(-1) if ctx.needs_input_grad[2] else None
+            grad_f = pulled * mass[..., None]
+        if ctx.needs_input_grad[1]:
+            grad_g = (f @ grad) * mass[..., None]
+        return grad_f, grad_g, grad_mass
