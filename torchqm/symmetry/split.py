@@ -4,7 +4,6 @@ The mathematics is that of :mod:`torchqm.symmetry.basis`, which splits one shape
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -50,12 +49,12 @@ class SplitBases:
     spectrum: Float[Tensor, "*B K"]
     mass: Float[Tensor, "*B V"]
 
-    @cached_property
+    @property
     def evecs_trans_even(self) -> Float[Tensor, "*B Ke V"]:
-        """``evecs_even^T diag(mass)``: from vertex values to coefficients of the even functions."""
+        """``evecs_even^T diag(mass)``: from vertex values to coefficients; computed anew each time."""
         return (self.evecs_even * self.mass[..., None]).mT
 
-    @cached_property
+    @property
     def evecs_trans_odd(self) -> Float[Tensor, "*B Ko V"]:
         """``evecs_odd^T diag(mass)``."""
         return (self.evecs_odd * self.mass[..., None]).mT
