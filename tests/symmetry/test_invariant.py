@@ -59,6 +59,17 @@ def test_invariant_losses(spectrum):
         assert gradcheck64(invariants, matrix + noise(5, 5, seed=1).triu(1) / 100)  # the symmetric part is what counts
 
 
+def test_tolerance_and_scale():
+    """A single vector's gradient, ``1 / (2 gap)``: there if the gap is above ``rtol scale``, else zero."""
+    for rtol, scale, expected in ((None, None, 50.0), (1e-2, None, 50.0), (2e-2, None, 0.0), (2e-2, 0.5, 50.0)):
+        matrix = torch.diag(torch.tensor([0.98, 0.99], dtype=torch.float64)).requires_grad_()
+        size = None if scale is None else torch.tensor(scale, dtype=torch.float64)
+        vectors = invariant_eigh(matrix, rtol, size)[1]
+        (grad,) = torch.autograd.grad(vectors[0, 1] * vectors[1, 1].detach().sign(), matrix)
+        assert grad[0, 1] == pytest.approx(expected)
+        assert grad[0, 1] == grad[1, 0]
+
+
 def test_torchs_own_gradient_is_not_finite_there():
     """What the backward pass is for: with torch.linalg.eigh the same losses give no number."""
     matrix = with_spectrum(SPECTRA["repeated"])[1].requires_grad_()
