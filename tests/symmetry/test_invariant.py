@@ -135,6 +135,15 @@ def test_projector(spectrum):
             assert gradcheck64(subspaces, given)
 
 
+def test_inside_a_half_there_is_no_gradient():
+    """A vector's turn towards one of its own half is gauge, at any gap; towards the other half it counts."""
+    matrix = torch.diag(torch.tensor([0.0, 0.1, 0.8, 0.9], dtype=torch.float64)).requires_grad_()
+    vectors = split_eigh(matrix)[1]
+    inside, across = (torch.autograd.grad(vectors[i, 3], matrix, retain_graph=True)[0] for i in (2, 0))
+    assert inside.abs().max() == 0
+    assert across[0, 3].abs() == pytest.approx(1 / (2 * 0.9))
+
+
 def test_nothing_above_the_threshold():
     matrix = with_spectrum([0.0, 0.1, 0.2, 0.3, 0.4])[0].requires_grad_()
     projector = spectral_projector(matrix)
