@@ -56,6 +56,13 @@ class Halves(NamedTuple):
     n_even: Tensor
     n: Tensor
 
+    @property
+    def spectrum(self) -> Tensor:
+        """The eigenvalues, real ones first, then zeros."""
+        k = self.weights.shape[-1]
+        place = torch.arange(k, device=self.weights.device)
+        return torch.where(place < self.n, torch.gather(self.weights, -1, (place + k - self.n) % k), 0.0)
+
 
 def find_halves(projection: Tensor, evals_mask: Tensor | None, rtol: float | None) -> Halves:
     """The eigenspaces of ``(P + P^T) / 2`` above one half (even) and below it (odd), and padding in neither."""

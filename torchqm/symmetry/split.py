@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 
 from torchqm.checks import Sizes, require_finite
 from torchqm.spectral.soft_map import SoftMap
-from torchqm.symmetry.halves import Halves, find_halves
+from torchqm.symmetry.halves import find_halves
 from torchqm.symmetry.invariant import column_signs, invariant_eigh
 from torchqm.symmetry.soft import check_basis, check_symmetry, project, without_padding
 
@@ -219,7 +219,7 @@ def _split(
     return SplitBases(
         *(evals_even, evecs @ coeffs_even, coeffs_even, even_mask),
         *(evals_odd, evecs @ coeffs_odd, coeffs_odd, odd_mask),
-        _front(halves, evals_mask),
+        halves.spectrum,
         mass,
     )
 
@@ -237,16 +237,6 @@ def _lowest(values: Tensor, coeffs: Tensor, chosen: Tensor, k: int) -> tuple[Ten
     if missing > 0:
         values, columns, mask = pad(values, (0, missing)), pad(columns, (0, missing)), pad(mask, (0, missing))
     return values, columns, mask
-
-
-def _front(halves: Halves, evals_mask: Tensor | None) -> Tensor:
-    """The eigenvalues of the projection, real ones first, then zeros."""
-    if evals_mask is None:
-        return halves.weights
-    k = halves.weights.shape[-1]
-    place = torch.arange(k, device=halves.weights.device)
-    weights = torch.gather(halves.weights, -1, (place + k - halves.n) % k)
-    return torch.where(place < halves.n, weights, 0.0)
 
 
 def _check_numbers(sizes: Sizes, evals: Tensor, k_even: int | None, k_odd: int | None) -> None:
