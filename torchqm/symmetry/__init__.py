@@ -20,6 +20,8 @@ from torchqm.symmetry.extrinsic import (
     find_reflections,
 )
 from torchqm.symmetry.group import GroupResiduals, SymmetryGroup
+from torchqm.symmetry.halves import symmetrized_projector
+from torchqm.symmetry.invariant import invariant_eigh, spectral_projector, split_eigh
 from torchqm.symmetry.irreducible import IsotypicComponent, isotypic_components
 from torchqm.symmetry.leftright import LeftRight, displacement, halves_of_reflection, persistence_clusters
 from torchqm.symmetry.orientation import (
@@ -31,6 +33,8 @@ from torchqm.symmetry.orientation import (
     orientation_tensor,
 )
 from torchqm.symmetry.projection import even_part, odd_part, projection_matrix
+from torchqm.symmetry.soft import projection_matrices
+from torchqm.symmetry.split import SplitBases, split_bases, symmetrized_bases
 
 __all__ = [
     "ExtrinsicGroup",
@@ -39,6 +43,7 @@ __all__ = [
     "GroupResiduals",
     "IsotypicComponent",
     "LeftRight",
+    "SplitBases",
     "SymmetrizedBasis",
     "SymmetryGroup",
     "central_idempotents",
@@ -54,6 +59,7 @@ __all__ = [
     "group_fault",
     "group_name",
     "halves_of_reflection",
+    "invariant_eigh",
     "inverses",
     "isotypic_components",
     "odd_part",
@@ -63,9 +69,15 @@ __all__ = [
     "orientation_form",
     "orientation_tensor",
     "persistence_clusters",
+    "projection_matrices",
     "projection_matrix",
     "real_degrees",
+    "spectral_projector",
+    "split_bases",
     "split_by_projector",
+    "split_eigh",
     "subgroup",
+    "symmetrized_bases",
     "symmetrized_basis",
+    "symmetrized_projector",
 ]
