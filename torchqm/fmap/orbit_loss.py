@@ -180,7 +180,7 @@ def distance_orbit_loss(
         raise ValueError("dist_y, orbit_dist: exactly one of them must be given")
     soft = rows_of_samples(soft_xy, samples, sizes)
     if orbit_dist is not None:
-        sizes.bind("orbit_dist", orbit_dist, "... N Y")
+        sizes.bind("orbit_dist", orbit_dist, "... X Y" if samples is None else "... N Y")
         require_weights("orbit_dist", orbit_dist)
         require_ids("p2p_xy", p2p_xy, sizes["Y"], none=True)
         gaps = torch.gather(orbit_dist, -1, soft.indices) if isinstance(soft, SoftMap) else orbit_dist

@@ -11,9 +11,11 @@ from torchqm.spectral.soft_map import SoftMap
 __all__ = ["Soft", "bind_soft", "distances_at", "negative_log_mass", "rows_at", "rows_of_samples", "values_of"]
 
 Soft = SoftMap | Float[Tensor, "*B X Y"]
+AnyRows = SoftMap | Tensor
+"""A soft map at the samples only."""
 
 
-def negative_log_mass(soft: Soft, sets: Tensor, log_weights: bool, eps: float) -> Tensor:
+def negative_log_mass(soft: AnyRows, sets: Tensor, log_weights: bool, eps: float) -> Tensor:
     """``-log`` of the mass on each of some sets of vertices ``sets (..., N, S, M)`` (-1: nobody): ``(..., N, S)``."""
     nobody = sets < 0
     if isinstance(soft, SoftMap):
@@ -32,7 +34,7 @@ def negative_log_mass(soft: Soft, sets: Tensor, log_weights: bool, eps: float) -
     return torch.log((1.0 + eps) * torch.ones_like(mass)) - torch.log(mass + eps)
 
 
-def distances_at(dist_y: Tensor, targets: Tensor, soft: Soft) -> Tensor:
+def distances_at(dist_y: Tensor, targets: Tensor, soft: AnyRows) -> Tensor:
     """Distances from ``targets (..., N)`` to all vertices of y, or to the k neighbours of each row."""
     if not isinstance(soft, SoftMap):
         return rows_at(dist_y, targets)
@@ -45,12 +47,12 @@ def rows_at(values: Tensor, ids: Tensor) -> Tensor:
     return torch.gather(values, -2, ids[..., None].expand(*ids.shape, values.shape[-1]))
 
 
-def values_of(soft: Soft) -> Tensor:
+def values_of(soft: AnyRows) -> Tensor:
     """The weights of a soft map, dense ``(..., X, Y)`` or sparse ``(..., X, k)``."""
     return soft.weights if isinstance(soft, SoftMap) else soft
 
 
-def rows_of_samples(soft: Soft, samples: Tensor | None, sizes: Sizes) -> Soft:
+def rows_of_samples(soft: AnyRows, samples: Tensor | None, sizes: Sizes) -> AnyRows:
     """The rows of a soft map at the samples, or all of them."""
     if samples is None:
         return soft

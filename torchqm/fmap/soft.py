@@ -217,7 +217,7 @@ def _best(
             scores = scores.masked_fill(~mask_y[..., None, :], limits.min)
         if include is not None:
             wanted = include[..., number * rows : (number + 1) * rows, :]
-            raised = torch.where(wanted >= 0, limits.max, limits.min).to(scores.dtype)
+            raised = torch.full_like(wanted, limits.min, dtype=scores.dtype).masked_fill(wanted >= 0, limits.max)
             scores = scores.scatter_reduce(-1, wanted.clamp_min(0), raised, "amax")
         found.append(scores.topk(k, -1).indices)
     best = torch.cat(found, -2)
@@ -265,18 +265,20 @@ def _require_tau(tau: float | Tensor) -> None:
         if tau.numel() != 1:
             raise ValueError(f"tau: shape {tuple(tau.shape)} given, expected a number or a tensor of one element")
         return
-    if not 0 < float(tau) < float("inf"):
-        raise ValueError(f"tau: {float(tau):.3g} given, expected a positive number")
+    value = float(tau.detach()) if isinstance(tau, Tensor) else tau
+    if not 0 < value < float("inf"):
+        raise ValueError(f"tau: {value:.3g} given, expected a positive number")
 
 
 def _require_range(feat_x: Tensor, feat_y: Tensor, tau: float | Tensor, squared: bool) -> None:
     if not enabled() or not feat_x.numel() or not feat_y.numel():
         return
     x, y = (float(feat.detach().abs().amax()) for feat in (feat_x, feat_y))
-    largest = feat_x.shape[-1] * y * (2 * x + y if squared else x) / float(tau)
+    value = float(tau.detach()) if isinstance(tau, Tensor) else tau
+    largest = feat_x.shape[-1] * y * (2 * x + y if squared else x) / value
     if not largest < torch.finfo(feat_x.dtype).max:
         raise ValueError(
-            f"tau: {float(tau):.3g} is too small for features as large as {max(x, y):.3g}: their similarities divided "
+            f"tau: {value:.3g} is too small for features as large as {max(x, y):.3g}: their similarities divided "
             f"by it would leave the range of {feat_x.dtype}"
         )
 
