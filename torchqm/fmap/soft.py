@@ -1,5 +1,6 @@
 """Soft point maps from features: a softmax over the vertices of the target, or over the k best of them only."""
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -156,11 +157,11 @@ class _Products(torch.autograd.Function):
     @staticmethod
     def forward(feat_x: Tensor, feat_y: Tensor, indices: Tensor, chunk: int | None) -> Tensor:
         rows = _rows(indices, indices.shape[-1] * feat_x.shape[-1], chunk)
-        parts = [
-            (_taken(feat_y, ids) @ part[..., None])[..., 0]
-            for part, ids in zip(feat_x.split(rows, -2), indices.split(rows, -2), strict=True)
-        ]
-        return torch.cat(parts, -2)
+
+        def block(at: slice) -> Tensor:
+            return (_taken(feat_y, indices[..., at, :]) @ feat_x[..., at, :, None])[..., 0]
+
+        return _by_blocks(block, feat_x.shape[-2], rows)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor, int | None], output: Tensor) -> None:
@@ -171,18 +172,38 @@ class _Products(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
         feat_x, feat_y, indices = ctx.saved_tensors
-        rows = _rows(indices, indices.shape[-1] * feat_x.shape[-1], ctx.chunk)
-        grad_x: list[Tensor] = []
-        grad_y = torch.zeros_like(feat_y)
-        for part, ids, grad in zip(
-            feat_x.split(rows, -2), indices.split(rows, -2), grads[0].split(rows, -2), strict=True
-        ):
-            if ctx.needs_input_grad[0]:
-                grad_x.append((grad[..., None, :] @ _taken(feat_y, ids))[..., 0, :])
-            if ctx.needs_input_grad[1]:
-                flat = ids.flatten(-2)[..., None].expand(*ids.shape[:-2], -1, feat_y.shape[-1])
-                grad_y = grad_y.scatter_add(-2, flat, (grad[..., None] * part[..., None, :]).flatten(-3, -2))
-        return torch.cat(grad_x, -2) if grad_x else None, grad_y if ctx.needs_input_grad[1] else None, None, None
+        rows, n = _rows(indices, indices.shape[-1] * feat_x.shape[-1], ctx.chunk), feat_x.shape[-2]
+        grad, grad_x, grad_y = grads[0], None, None
+
+        def block(at: slice) -> Tensor:
+            return (grad[..., at, None, :] @ _taken(feat_y, indices[..., at, :]))[..., 0, :]
+
+        if ctx.needs_input_grad[0]:
+            grad_x = _by_blocks(block, n, rows)
+        if ctx.needs_input_grad[1]:
+            grad_y = torch.zeros_like(feat_y)
+            for start in range(0, n, rows):
+                at = slice(start, start + rows)
+                outer = (grad[..., at, :, None] * feat_x[..., at, None, :]).flatten(-3, -2)
+                ids = indices[..., at, :].flatten(-2)[..., None]
+                grad_y = grad_y.scatter_add(-2, ids.expand(*ids.shape[:-1], feat_y.shape[-1]), outer)
+        return grad_x, grad_y, None, None
+
+
+def _by_blocks(block: Callable[[slice], Tensor], n: int, rows: int) -> Tensor:
+    """``block`` of some rows at a time, all results in one tensor made in time.
+
+    Small results that live on between large blocks that come and go would split the memory these leave: allocators
+    then take new memory for each block, as much as the matrix that is not to be made.
+    """
+    first = block(slice(0, rows))
+    if rows >= n:
+        return first
+    out = first[..., :1, :].expand(*first.shape[:-2], n, first.shape[-1]).clone()  # a batch under vmap, as first is
+    out[..., :rows, :] = first
+    for start in range(rows, n, rows):
+        out[..., start : start + rows, :] = block(slice(start, start + rows))
+    return out
 
 
 def _taken(feat_y: Tensor, ids: Tensor) -> Tensor:
@@ -206,21 +227,21 @@ def _best(
     chunk: int | None,
 ) -> Tensor:
     limits = torch.finfo(feat_y.dtype)
-    rows = _rows(feat_x, feat_y.shape[-2], chunk)
     columns = feat_y.transpose(-1, -2)
-    found = []
-    for number, part in enumerate(feat_x.split(rows, -2)):
-        scores = part @ columns
+
+    def block(at: slice) -> Tensor:
+        scores = feat_x[..., at, :] @ columns
         if bias is not None:
             scores = scores + bias.detach()[..., None, :]
         if mask_y is not None:
             scores = scores.masked_fill(~mask_y[..., None, :], limits.min)
         if include is not None:
-            wanted = include[..., number * rows : (number + 1) * rows, :]
+            wanted = include[..., at, :]
             raised = torch.full_like(wanted, limits.min, dtype=scores.dtype).masked_fill(wanted >= 0, limits.max)
             scores = scores.scatter_reduce(-1, wanted.clamp_min(0), raised, "amax")
-        found.append(scores.topk(k, -1).indices)
-    best = torch.cat(found, -2)
+        return scores.topk(k, -1).indices
+
+    best = _by_blocks(block, feat_x.shape[-2], _rows(feat_x, feat_y.shape[-2], chunk))
     if include is None:
         return best
     # Those that were to be kept came first; the order is by similarity again.

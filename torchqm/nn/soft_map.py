@@ -110,4 +110,5 @@ class SoftPointMap(nn.Module):
     def extra_repr(self) -> str:
         """The options, for ``print``."""
         learned = "" if self.log_tau is None else ", learn_tau=True"
-        return f"tau={float(self.tau):.3g}{learned}, k={self.k}, kind={self.kind}, normalize={self.normalize}"
+        tau = self.tau.item() if isinstance(self.tau, Tensor) else self.tau
+        return f"tau={tau:.3g}{learned}, k={self.k}, kind={self.kind}, normalize={self.normalize}"
