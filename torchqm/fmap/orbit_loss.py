@@ -1,0 +1,295 @@
+"""Supervision that does not care which point of an orbit is hit: four losses, each invariant under the target's group.
+
+In all of them ``T = p2p_xy (..., N)`` gives for points x of one shape their true vertices on y (-1: no truth), x runs
+over all vertices or over ``samples (..., N)``, and the ``a_x`` are areas that sum to 1
+(:func:`~torchqm.fmap.orbit_truth.point_weights`). The target's group is a table of vertex maps ``group_y (..., G, Y)``,
+row 0 the identity. Every function returns one value for each shape of the batch; points without truth have weight 0.
+"""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchqm.checks import Sizes, require_finite
+from torchqm.fmap.orbit_terms import (
+    Soft,
+    bind_soft,
+    distances_at,
+    negative_log_mass,
+    rows_at,
+    rows_of_samples,
+    values_of,
+)
+from torchqm.fmap.orbit_truth import images_of, orbit_members, point_weights, soft_minimum
+from torchqm.fmap.tables import check_group, require_ids, require_weights
+from torchqm.spectral.soft_map import SoftMap
+
+__all__ = ["assignment_orbit_loss", "distance_orbit_loss", "map_orbit_loss", "spectral_orbit_loss"]
+
+EPS = 1e-12
+
+
+def spectral_orbit_loss(
+    fmap_even: Float[Tensor, "*B Ky Kx"],
+    evecs_even_x: Float[Tensor, "*B X Kx"],
+    evecs_even_y: Float[Tensor, "*B Y Ky"],
+    p2p_xy: Int[Tensor, "*B N"],
+    mass_x: Float[Tensor, "*B X"] | None = None,
+    samples: Int[Tensor, "*B N"] | None = None,
+    truth_mask: Bool[Tensor, "*B N"] | None = None,
+) -> Float[Tensor, "*B"]:
+    """``sum_x a_x || C phi+_x - phi+_T(x) ||^2``: the even map sends the delta of a point to that of its true orbit.
+
+    ``phi+_x`` is row x of the even basis, the coefficients of the symmetrised delta. The rows of the points of one
+    orbit are equal, so the loss is invariant without knowing the group (as nearly as the basis is even).
+
+    Args:
+        fmap_even: ``(..., Ky, Kx)`` takes even functions on x to even functions on y; 0 at padded functions.
+        evecs_even_x: ``(..., X, Kx)`` even basis of x, at all its vertices.
+        evecs_even_y: ``(..., Y, Ky)`` even basis of y.
+        p2p_xy: ``(..., N)`` true vertices of y; -1: no truth.
+        mass_x: ``(..., X)`` vertex areas of x; all equal if not given.
+        samples: ``(..., N)`` the points, vertices of x; all in order if not given.
+        truth_mask: ``(..., N)`` false: no truth.
+
+    Returns:
+        ``(...)`` one value for each shape, without unit where bases are orthonormal on shapes of area 1.
+
+    Raises:
+        ValueError: shapes do not fit, ids are out of range, areas are negative, something is not finite, or a shape has
+            no point with a truth and an area.
+
+    Example:
+        >>> basis = torch.tensor([[[1.0], [1.0]]])
+        >>> spectral_orbit_loss(torch.tensor([[[3.0]]]), basis, basis, torch.tensor([[1, 0]])).tolist()
+        [4.0]
+
+    References:
+        Paper, sections 4.2 (symmetrised deltas) and 4.4.
+    """
+    sizes = Sizes()
+    sizes.bind("fmap_even", fmap_even, "... Ky Kx")
+    sizes.bind("evecs_even_x", evecs_even_x, "... X Kx")
+    sizes.bind("evecs_even_y", evecs_even_y, "... Y Ky")
+    for name, value in (("fmap_even", fmap_even), ("evecs_even_x", evecs_even_x), ("evecs_even_y", evecs_even_y)):
+        require_finite(name, value)
+    weights = _weights(sizes, fmap_even, p2p_xy, mass_x, samples, truth_mask)
+    if samples is not None:
+        require_ids("samples", samples, sizes["X"])
+        evecs_even_x = rows_at(evecs_even_x, samples)
+    images = evecs_even_x @ fmap_even.transpose(-1, -2)
+    gaps = (images - rows_at(evecs_even_y, p2p_xy.clamp_min(0))).square().sum(-1)
+    return (weights * gaps).sum(-1)
+
+
+def assignment_orbit_loss(
+    soft_xy: Soft,
+    p2p_xy: Int[Tensor, "*B N"],
+    group_y: Int[Tensor, "*B G Y"],
+    mass_x: Float[Tensor, "*B X"] | None = None,
+    samples: Int[Tensor, "*B N"] | None = None,
+    truth_mask: Bool[Tensor, "*B N"] | None = None,
+    group_mask: Bool[Tensor, "*B G"] | None = None,
+    log_weights: bool = False,
+    eps: float = EPS,
+) -> Float[Tensor, "*B"]:
+    """``-sum_x a_x log sum_{y in orbit(T(x))} Pi(x, y)``: the mass that a soft map puts on the orbit of the truth.
+
+    A member that the table names twice (a fixed point's image) counts once. Weights enter as
+    ``log((m + eps) / (1 + eps))``, m the mass on the orbit: 0 at m = 1, finite at m = 0, where the derivative is
+    ``-1 / eps``, so a gradient still pulls, as far as the softmax passes it on. For weights far below ``eps`` give
+    logarithms (``log_weights``): then the loss is ``-logsumexp`` over the orbit, without ``eps``, and pulls from any
+    distance. Of a sparse map the mass that its k neighbours have on the orbit counts; where none of them lies on it the
+    value is ``-log(eps / (1 + eps))`` without gradient: have :func:`torchqm.fmap.soft.soft_map` ``include`` the orbit.
+
+    Args:
+        soft_xy: for each x weights over the vertices of y: dense ``(..., X, Y)``, or sparse.
+        p2p_xy: ``(..., N)`` true vertices of y; -1: no truth.
+        group_y: ``(..., G, Y)`` symmetries of y, row 0 the identity.
+        mass_x: ``(..., X)`` vertex areas of x; all equal if not given.
+        samples: ``(..., N)`` the points, vertices of x; all in order if not given.
+        truth_mask: ``(..., N)`` false: no truth.
+        group_mask: ``(..., G)`` real elements.
+        log_weights: ``soft_xy`` holds ``log Pi`` (``torch.log_softmax``), minus infinity allowed; dense only.
+        eps: floor of the mass.
+
+    Returns:
+        ``(...)`` one value for each shape (nats).
+
+    Raises:
+        ValueError: as :func:`spectral_orbit_loss`; also negative weights, ``eps`` not in ``(0, 1)``, or row 0 of the
+            table is not the identity.
+
+    Example:
+        >>> mirror = torch.tensor([[0, 1, 2], [2, 1, 0]])
+        >>> uniform = torch.full((3, 3), 1 / 3)
+        >>> assignment_orbit_loss(uniform, torch.tensor([0, -1, 2]), mirror).mul(100).round().item()  # -log(2 / 3)
+        41.0
+    """
+    _require_eps(eps)
+    sizes = bind_soft(soft_xy, log_weights)
+    sizes.bind("group_y", group_y, "... G Y")
+    weights = _weights(sizes, values_of(soft_xy), p2p_xy, mass_x, samples, truth_mask)
+    members = orbit_members(p2p_xy, group_y, group_mask)
+    soft = rows_of_samples(soft_xy, samples, sizes)
+    losses = negative_log_mass(soft, members[..., None, :], log_weights, eps)[..., 0]
+    return (weights * losses).sum(-1)
+
+
+def distance_orbit_loss(
+    soft_xy: Soft,
+    p2p_xy: Int[Tensor, "*B N"],
+    group_y: Int[Tensor, "*B G Y"] | None = None,
+    dist_y: Float[Tensor, "*B Y Y"] | None = None,
+    orbit_dist: Float[Tensor, "*B N Y"] | None = None,
+    mass_x: Float[Tensor, "*B X"] | None = None,
+    samples: Int[Tensor, "*B N"] | None = None,
+    truth_mask: Bool[Tensor, "*B N"] | None = None,
+    group_mask: Bool[Tensor, "*B G"] | None = None,
+) -> Float[Tensor, "*B"]:
+    """``sum_x a_x sum_y Pi(x, y) d(y, orbit(T(x)))^2``: the expected squared distance to the orbit of the truth.
+
+    Args:
+        soft_xy: for each x weights over the vertices of y: dense ``(..., X, Y)``, or sparse. Of a sparse map distances
+            at its k neighbours only are looked up: nothing of size ``(N, Y)`` is made.
+        p2p_xy: ``(..., N)`` true vertices of y; -1: no truth.
+        group_y: ``(..., G, Y)`` symmetries of y, row 0 the identity; with ``dist_y``.
+        dist_y: ``(..., Y, Y)`` geodesic distances on y (length); symmetric.
+        orbit_dist: ``(..., N, Y)`` distances of all vertices of y from the orbit of each truth, instead of ``dist_y``.
+        mass_x: ``(..., X)`` vertex areas of x; all equal if not given.
+        samples: ``(..., N)`` the points, vertices of x; all in order if not given.
+        truth_mask: ``(..., N)`` false: no truth.
+        group_mask: ``(..., G)`` real elements.
+
+    Returns:
+        ``(...)`` one value for each shape (length^2).
+
+    Raises:
+        ValueError: as :func:`assignment_orbit_loss`; also negative distances, or not exactly one of ``dist_y`` (with
+            ``group_y``) and ``orbit_dist``.
+
+    Example:
+        >>> mirror = torch.tensor([[0, 1, 2], [2, 1, 0]])
+        >>> line = torch.tensor([[0.0, 1.0, 2.0], [1.0, 0.0, 1.0], [2.0, 1.0, 0.0]])
+        >>> distance_orbit_loss(torch.eye(3), torch.tensor([2, 1, 1]), mirror, line, samples=torch.tensor([0, 1, 2]))
+        tensor(0.3333)
+    """
+    sizes = bind_soft(soft_xy)
+    weights = _weights(sizes, values_of(soft_xy), p2p_xy, mass_x, samples, truth_mask)
+    if (dist_y is None) == (orbit_dist is None):
+        raise ValueError("dist_y, orbit_dist: exactly one of them must be given")
+    soft = rows_of_samples(soft_xy, samples, sizes)
+    if orbit_dist is not None:
+        sizes.bind("orbit_dist", orbit_dist, "... X Y" if samples is None else "... N Y")
+        require_weights("orbit_dist", orbit_dist)
+        require_ids("p2p_xy", p2p_xy, sizes["Y"], none=True)
+        gaps = torch.gather(orbit_dist, -1, soft.indices) if isinstance(soft, SoftMap) else orbit_dist
+    else:
+        if group_y is None or dist_y is None:
+            raise ValueError("group_y: must be given with dist_y")
+        _check_distances(sizes, dist_y, group_y)
+        members = orbit_members(p2p_xy, group_y, group_mask)
+        # What is left over repeats a member, which changes no minimum.
+        members = torch.where(members < 0, members[..., :1].clamp_min(0), members)
+        gaps = distances_at(dist_y, members[..., 0], soft)
+        for g in range(1, members.shape[-1]):
+            gaps = torch.minimum(gaps, distances_at(dist_y, members[..., g], soft))
+    return (weights * (values_of(soft) * gaps.square()).sum(-1)).sum(-1)
+
+
+def map_orbit_loss(
+    soft_xy: Soft,
+    p2p_xy: Int[Tensor, "*B N"],
+    group_y: Int[Tensor, "*B G Y"],
+    dist_y: Float[Tensor, "*B Y Y"] | None = None,
+    temperature: float = 0.1,
+    mass_x: Float[Tensor, "*B X"] | None = None,
+    samples: Int[Tensor, "*B N"] | None = None,
+    truth_mask: Bool[Tensor, "*B N"] | None = None,
+    group_mask: Bool[Tensor, "*B G"] | None = None,
+    log_weights: bool = False,
+    eps: float = EPS,
+) -> Float[Tensor, "*B"]:
+    """``-t log mean_g exp(-L_g / t)``: the loss against ``g o T`` for the best element g of the whole map, softly.
+
+    Without ``dist_y``, ``L_g = -sum_x a_x log Pi(x, g(T(x)))`` (with ``eps`` as in :func:`assignment_orbit_loss`); with
+    it, ``L_g = sum_x a_x sum_y Pi(x, y) d(y, g(T(x)))^2``. Unlike the losses of single points this one does not accept
+    a map that takes one g here and another there. ``t -> 0`` gives ``min_g L_g``; equal ``L_g`` give their value.
+
+    With a dense map and distances, G tensors ``(N, Y)`` are kept for the backward pass; of a sparse one, ``(N, k)``.
+
+    Args:
+        soft_xy: for each x weights over the vertices of y: dense ``(..., X, Y)``, or sparse.
+        p2p_xy: ``(..., N)`` true vertices of y; -1: no truth.
+        group_y: ``(..., G, Y)`` symmetries of y, row 0 the identity.
+        dist_y: ``(..., Y, Y)`` geodesic distances on y (length).
+        temperature: t, in the unit of ``L_g`` (nats or length^2); 0 for the hard minimum.
+        mass_x: ``(..., X)`` vertex areas of x; all equal if not given.
+        samples: ``(..., N)`` the points, vertices of x; all in order if not given.
+        truth_mask: ``(..., N)`` false: no truth.
+        group_mask: ``(..., G)`` real elements; a padded element that is not masked would count as another identity.
+        log_weights: ``soft_xy`` holds ``log Pi``; dense and without ``dist_y`` only.
+        eps: floor of the weights.
+
+    Returns:
+        ``(...)`` one value for each shape.
+
+    Raises:
+        ValueError: as the other losses; also a negative temperature.
+
+    Example:
+        >>> mirror = torch.tensor([[0, 1, 2], [2, 1, 0]])
+        >>> flipped = torch.eye(3).flip(0)
+        >>> map_orbit_loss(flipped, torch.tensor([0, 1, 2]), mirror, temperature=0.0).item()
+        0.0
+    """
+    _require_eps(eps)
+    if log_weights and dist_y is not None:
+        raise ValueError("log_weights: distances need the weights themselves")
+    sizes = bind_soft(soft_xy, log_weights)
+    sizes.bind("group_y", group_y, "... G Y")
+    weights = _weights(sizes, values_of(soft_xy), p2p_xy, mass_x, samples, truth_mask)
+    check_group("group_y", group_y, group_mask)
+    require_ids("p2p_xy", p2p_xy, sizes["Y"], none=True)
+    images = images_of(p2p_xy, group_y)
+    soft = rows_of_samples(soft_xy, samples, sizes)
+    if dist_y is None:
+        losses = (weights[..., None] * negative_log_mass(soft, images[..., None], log_weights, eps)).sum(-2)
+    else:
+        _check_distances(sizes, dist_y, group_y)
+        per_element = [
+            (weights * (values_of(soft) * distances_at(dist_y, images[..., g], soft).square()).sum(-1)).sum(-1)
+            for g in range(images.shape[-1])
+        ]
+        losses = torch.stack(per_element, -1)
+    return soft_minimum(losses, temperature, group_mask)
+
+
+def _weights(
+    sizes: Sizes,
+    like: Tensor,
+    p2p_xy: Tensor,
+    mass_x: Tensor | None,
+    samples: Tensor | None,
+    truth_mask: Tensor | None,
+) -> Tensor:
+    sizes.bind("p2p_xy", p2p_xy, "... N" if samples is not None else "... X")
+    if samples is not None:
+        sizes.bind("samples", samples, "... N")
+    if truth_mask is not None:
+        sizes.bind("truth_mask", truth_mask, "... N" if samples is not None else "... X")
+    if mass_x is not None:
+        sizes.bind("mass_x", mass_x, "... X")
+    require_ids("p2p_xy", p2p_xy, sizes["Y"], none=True)
+    return point_weights(p2p_xy, like, mass_x, samples, truth_mask)
+
+
+def _check_distances(sizes: Sizes, dist_y: Tensor, group_y: Tensor) -> None:
+    sizes.bind("dist_y", dist_y, "... Y Y")
+    sizes.bind("group_y", group_y, "... G Y")
+    require_weights("dist_y", dist_y)
+
+
+def _require_eps(eps: float) -> None:
+    if not 0 < eps < 1:
+        raise ValueError(f"eps: {eps} given, expected a number between 0 and 1")
