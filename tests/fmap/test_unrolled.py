@@ -1,0 +1,108 @@
+"""torchqm.fmap.unrolled: with a temperature near zero the classical refinement, and gradients through all steps."""
+
+import pytest
+import torch
+from references.pairs import exact_pair
+from references.unchecked import unchecked
+
+from torchqm.fmap import nearest_isometry, quotient_icp, upsample
+from torchqm.fmap.unrolled import soft_icp, soft_upsample
+from torchqm.testing import gradcheck64
+
+COLD = 1e-7
+"""All weight goes to the nearest."""
+
+
+def blurred(size, seed=0, amount=0.15):
+    noise = torch.randn(size, size, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return nearest_isometry(torch.eye(size, dtype=torch.float64) + amount * noise)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    exact = exact_pair()
+    return exact.x.basis.truncate(20), exact.y.basis.truncate(20)
+
+
+@pytest.mark.parametrize("neighbours", [None, 4])
+def test_cold_is_icp(pair, neighbours):
+    x, y = (basis.truncate(8) for basis in pair)
+    samples = torch.arange(0, x.n_verts, 3)
+    start = blurred(8)
+    found = soft_icp(start, x.evecs[samples], y.evecs, 3, COLD, neighbours)
+    torch.testing.assert_close(found, quotient_icp(start, x, y, samples, 3))
+    assert not torch.allclose(found, start, atol=1e-2)
+
+
+def test_cold_is_upsampling(pair):
+    x, y = pair
+    samples = torch.arange(0, x.n_verts, 3)
+    start = blurred(8)
+    found = soft_upsample(start, x.evecs[samples], y.evecs, [12, 20], 2, COLD)
+    torch.testing.assert_close(found, upsample(start, x, y, samples, [12, 20], 2))
+
+
+def test_a_batch_is_each_alone_and_padding_stays_empty(pair):
+    x, y = pair
+    first = soft_icp(blurred(8), x.evecs[:60, :8], y.evecs[:, :8], 2, weights_x=x.mass[:60])
+    second = soft_icp(blurred(6, 1), x.evecs[:90, :6], y.evecs[:500, :6], 2, weights_x=x.mass[:90])
+    pad = torch.nn.functional.pad
+    n = y.n_verts
+    masks = torch.arange(8) < torch.tensor([[8], [6]])
+    both = soft_icp(
+        torch.stack([blurred(8), pad(blurred(6, 1), (0, 2, 0, 2))]),
+        torch.stack([pad(x.evecs[:60, :8], (0, 0, 0, 30)), pad(x.evecs[:90, :6], (0, 2))]),
+        torch.stack([y.evecs[:, :8], pad(y.evecs[:500, :6], (0, 2, 0, n - 500))]),
+        2,
+        weights_x=torch.stack([pad(x.mass[:60], (0, 30)), x.mass[:90]]),
+        verts_mask_y=torch.arange(n) < torch.tensor([[n], [500]]),
+        evals_mask_x=masks,
+        evals_mask_y=masks,
+    )
+    torch.testing.assert_close(both[0], first)
+    # The temperature is per function: padding counts as functions that agree.
+    warmer = soft_icp(blurred(6, 1), x.evecs[:90, :6], y.evecs[:500, :6], 2, 0.02 * 8 / 6, weights_x=x.mass[:90])
+    torch.testing.assert_close(both[1, :6, :6], warmer)
+    assert not torch.allclose(second, warmer)
+    assert not both[1, 6:].any()
+    assert not both[1, :, 6:].any()
+
+
+@pytest.mark.parametrize("neighbours", [None, 3])
+def test_gradients(pair, neighbours):
+    x, y = pair
+    at_x, at_y, weights = x.evecs[:9, :4], y.evecs[40:52, :4], x.mass[:9]
+    gradcheck64(
+        lambda c, a, b, w, t: soft_icp(c, a, b, 2, t, neighbours, w).square().mul(torch.arange(4.0)).sum(),
+        *(blurred(4), at_x, at_y, weights, torch.tensor(0.3)),
+    )
+    gradcheck64(
+        lambda c, a, b: soft_upsample(c, a, b, [3, 4], 1, 0.3, neighbours).square().mul(torch.arange(4.0)).sum(),
+        *(blurred(2), at_x, at_y),
+    )
+
+
+def test_a_semi_quotient_map_keeps_its_shape(pair):
+    x, y = pair
+    start = nearest_isometry(blurred(8)[:5])
+    found = soft_icp(start, x.evecs[:, :8], y.evecs[:, :5], 2)
+    torch.testing.assert_close(found @ found.T, torch.eye(5, dtype=torch.float64))
+
+
+def test_bad_input_is_named(pair):
+    x, y = pair
+    start = blurred(8)
+    at_x, at_y = x.evecs[:, :8], y.evecs[:, :8]
+    icp, grow = unchecked(soft_icp), unchecked(soft_upsample)
+    with pytest.raises(ValueError, match=r"evecs_x: shape \(642, 9\) given, .* Kx = 8 as in fmap_xy"):
+        icp(start, x.evecs[:, :9], at_y)
+    with pytest.raises(ValueError, match="tau=0: the temperature must be positive"):
+        icp(start, at_x, at_y, tau=0)
+    with pytest.raises(ValueError, match="steps=-1"):
+        icp(start, at_x, at_y, -1)
+    with pytest.raises(ValueError, match="fmap_xy: 64 of 64 entries are NaN"):
+        icp(start * torch.nan, at_x, at_y)
+    with pytest.raises(ValueError, match=r"sizes: \[21\] given, but the bases have 20 and 20 functions"):
+        grow(start, x.evecs, y.evecs, [10, 21])
+    with pytest.raises(ValueError, match=r"fmap_xy: shape \(8, 8\) given, but the bases have 5 and 20"):
+        grow(start, x.evecs, at_y[:, :5], [5])
