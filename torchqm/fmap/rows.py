@@ -75,8 +75,8 @@ def solve_rows(
 
     Raises:
         ValueError: shapes that do not fit, ``row_chunk < 1``, or entries that are not finite;
-            :class:`UndeterminedRowsError` (a ``ValueError``) where a system is singular to the precision of its dtype:
-            a pivot is what rounding leaves of its diagonal entry.
+            :class:`UndeterminedRowsError` (a ``ValueError``) where a system is singular to the precision of its dtype
+            (about ``8 sqrt(Kx) eps``, with its diagonal scaled to ones).
 
     Example:
         >>> gram, diagonal = torch.eye(2), torch.tensor([[0.0, 1.0], [1.0, 3.0]])
@@ -96,7 +96,7 @@ def solve_rows(
 
 @torch.library.custom_op("torchqm::solve_rows", mutates_args=())
 def _solve_rows(gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool) -> tuple[Tensor, Tensor]:
-    """The rows, and the factor ``(Ky, samples, Kx, Kx)``, empty unless kept; rows first, so that chunks lie together."""
+    """The rows, and the factor ``(Ky, samples, Kx, Kx)``, empty unless kept; rows first: chunks lie together."""
     ky, kx = rhs.shape[-2:]
     n = prod(rhs.shape[:-2])
     systems = gram.reshape(n, kx, kx)
@@ -106,12 +106,20 @@ def _solve_rows(gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, kee
     factor = gram.new_empty((ky, n, kx, kx) if keep else 0)
     workspace = gram.new_empty((0 if keep else min(step, ky), n, kx, kx))
     rows = gram.new_empty(ky, n, kx)
+    probes, noise = _probes(gram), 8 * max(kx, 1) ** 0.5 * torch.finfo(gram.dtype).eps
     singular = torch.zeros(ky, n, dtype=torch.bool, device=gram.device)
     for start in range(0, ky, step):
         part = slice(start, start + step)
         lower = factor[part] if keep else workspace[: len(rows[part])]
-        singular[part] = _factorize(systems, entries[part], lower)
-        rows[part] = _solve_factored(lower, right[part])
+        failed = _factorize(systems, entries[part], lower)
+        # With a diagonal of ones, a system applied backwards to vectors of signs makes them as long as 1 / its smallest
+        # eigenvalue. If that is what rounding leaves of zero, the solution is noise. Pivots alone do not show it: they
+        # can be 1e6 times as large.
+        unit = (systems.diagonal(dim1=-2, dim2=-1) + entries[part]).clamp_min(0).sqrt()[..., None]
+        solved = _solve_factored(lower, torch.cat([right[part, ..., None], unit * probes], -1))
+        longest = (unit * solved[..., 1:]).square().sum(-2).amax(-1).sqrt()
+        singular[part] = failed | ~(longest * noise < 1)
+        rows[part] = solved[..., 0]
     if bool(singular.any()):
         for name, values in (("descriptors", gram), ("lmbda and eigenvalues", diagonal)):
             if not bool(torch.isfinite(values).all()):
@@ -124,12 +132,12 @@ def _solve_rows(gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, kee
 def _solve_rows_again(rhs: Tensor, factor: Tensor) -> Tensor:
     """The same systems with other right-hand sides."""
     ky, kx = rhs.shape[-2:]
-    right = rhs.reshape(prod(rhs.shape[:-2]), ky, kx).transpose(0, 1)
-    return _solve_factored(factor, right).transpose(0, 1).reshape(rhs.shape).contiguous()
+    right = rhs.reshape(prod(rhs.shape[:-2]), ky, kx).transpose(0, 1)[..., None]
+    return _solve_factored(factor, right)[..., 0].transpose(0, 1).reshape(rhs.shape).contiguous()
 
 
 def _factorize(gram: Tensor, diagonal: Tensor, out: Tensor) -> Tensor:
-    """Cholesky factors of ``gram + diag(diagonal)`` into the lower triangles of ``out``; which of them are singular.
+    """Cholesky factors of ``gram + diag(diagonal)`` into the lower triangles of ``out``; which of them there are not.
 
     Args:
         gram: ``(n, K, K)``.
@@ -154,17 +162,19 @@ def _factorize(gram: Tensor, diagonal: Tensor, out: Tensor) -> Tensor:
         if end < k:
             below = torch.linalg.solve_triangular(corner.mT, columns[:, end - j :], upper=True, left=False)
             lower[:, end:, j:end] = below
-    # A pivot that rounding alone keeps above zero: the row is undetermined, and its solution would be noise. Compared
-    # with its own diagonal entry, since a system and a scaled one are equally hard.
-    pivots = lower.diagonal(dim1=1, dim2=2).square().view(r, n, k)
-    entries = gram.diagonal(dim1=1, dim2=2) + diagonal
-    noise = 2 * max(k, 16) * torch.finfo(gram.dtype).eps
-    return failed.view(r, n) | ~(pivots > noise * entries).all(-1)
+    return failed.view(r, n)
 
 
-def _solve_factored(lower: Tensor, rhs: Tensor) -> Tensor:
-    half = torch.linalg.solve_triangular(lower, rhs[..., None], upper=False)
-    return torch.linalg.solve_triangular(lower.mT, half, upper=True)[..., 0]
+def _solve_factored(lower: Tensor, columns: Tensor) -> Tensor:
+    half = torch.linalg.solve_triangular(lower, columns, upper=False)
+    return torch.linalg.solve_triangular(lower.mT, half, upper=True)
+
+
+def _probes(like: Tensor) -> Tensor:
+    """``(K, 3)`` signs without a pattern, the same in every call."""
+    place = torch.arange(like.shape[-1], device=like.device, dtype=like.dtype)[:, None] + 0.5
+    phases = place.square() * torch.arange(1, 4, device=like.device, dtype=like.dtype)
+    return torch.where(phases.cos() > 0, 1.0, -1.0).to(like.dtype)
 
 
 @_solve_rows.register_fake

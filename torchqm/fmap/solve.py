@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchqm.fmap.regularized import commutativity_mask
+from torchqm.fmap.commutativity import commutativity_mask
 from torchqm.fmap.rows import UndeterminedRowsError, solve_rows
 
 __all__ = ["solve_fmap"]

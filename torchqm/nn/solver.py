@@ -27,7 +27,7 @@ class FunctionalMapSolver(nn.Module):
         resolvant_gamma: exponent of the resolvent mask (its name in ULRSSM).
         bidirectional: solve for the map from y to x, too.
         commutativity: ``resolvent``, ``normalized`` or ``squared``, see
-            :func:`torchqm.fmap.regularized.commutativity_mask`.
+            :func:`torchqm.fmap.commutativity.commutativity_mask`.
         learn_lmbda: make ``lmbda`` a parameter; its logarithm is learned, so that it stays positive.
         extra_weight: weight of the further descriptors against the features.
         ridge: multiple of the mean descriptor energy added to every diagonal.
@@ -120,7 +120,8 @@ class FunctionalMapSolver(nn.Module):
             None. With odd bases each of the two is a pair: even to even, odd to odd.
 
         Raises:
-            ValueError: see :func:`torchqm.fmap.regularized.regularized_fmap`; also where arguments are given that need each other.
+            ValueError: see :func:`torchqm.fmap.regularized.regularized_fmap`; also where one of several arguments that
+                need each other is missing.
         """
         if (extra_x is None) != (extra_y is None):
             raise ValueError("extra_x, extra_y: give both or none")
