@@ -4,7 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchqm.fmap.energy import commutativity_weights
+from torchqm.fmap.commutativity import commutativity_mask
+from torchqm.fmap.rows import UndeterminedRowsError, solve_rows
 
 __all__ = ["solve_fmap"]
 
@@ -60,20 +61,14 @@ def solve_fmap(
         )
     if weight < 0 or ridge < 0:
         raise ValueError(f"weight={weight}, ridge={ridge}: neither may be negative")
-    if normalize:
-        scale = torch.maximum(evals_x.max(), evals_y.max()).clamp_min(1e-300)
-        evals_x, evals_y = evals_x / scale, evals_y / scale
     gram = coeffs_x @ coeffs_x.T
-    gram = gram + ridge * gram.diagonal().mean() * torch.eye(gram.shape[0], dtype=gram.dtype)
-    systems = gram[None] + torch.diag_embed(weight * commutativity_weights(evals_x, evals_y))
-    factor, info = torch.linalg.cholesky_ex(systems)
-    diagonal = factor.diagonal(dim1=1, dim2=2)
-    # A pivot that rounding alone keeps above zero: the row is undetermined, and its solution would be noise.
-    singular = (info > 0) | (diagonal.min(1).values <= 1e-7 * diagonal.max(1).values.clamp_min(1e-300))
-    if bool(singular.any()):
-        rows = singular.nonzero().flatten().tolist()
+    diagonal = weight * commutativity_mask(evals_x, evals_y, "normalized" if normalize else "squared")
+    diagonal = diagonal + ridge * gram.diagonal().mean()
+    try:
+        return solve_rows(gram, diagonal, coeffs_y @ coeffs_x.T)
+    except UndeterminedRowsError as error:
+        rows = error.undetermined.nonzero().flatten().tolist()
         raise ValueError(
             f"the descriptors (rank {int(torch.linalg.matrix_rank(gram))} of {gram.shape[0]}) and weight={weight} "
             f"leave row(s) {rows[:5]} of the map undetermined; give a positive weight or more descriptors"
-        )
-    return torch.cholesky_solve((coeffs_y @ coeffs_x.T)[:, :, None], factor)[:, :, 0]
+        ) from error
