@@ -18,5 +18,20 @@ def test_examples_run_and_find_good_maps(script, bound, capsys):
         assert float(line.split()[-2]) < bound, line
 
 
+def test_two_lines_make_a_pipeline_quotient_aware(capsys):
+    runpy.run_path(str(EXAMPLES / "dropin_ulrssm.py"), run_name="__main__")
+    full, even = (float(line.split()[-2]) for line in capsys.readouterr().out.splitlines())
+    assert even < 0.02
+    assert even < full / 2
+
+
+def test_a_bare_loop_learns(capsys):
+    runpy.run_path(str(EXAMPLES / "dropin_bare.py"), run_name="__main__")
+    losses = [float(line.split()[-1]) for line in capsys.readouterr().out.splitlines()]
+    assert len(losses) == 10
+    assert losses[-1] < 0.8 * losses[0]
+
+
 def test_every_example_is_run():
-    assert {path.name for path in EXAMPLES.glob("*.py")} == {"quotient_by_hand.py", "match_two_creatures.py"}
+    scripts = {"quotient_by_hand.py", "match_two_creatures.py", "dropin_ulrssm.py", "dropin_bare.py"}
+    assert {path.name for path in EXAMPLES.glob("*.py")} == scripts
