@@ -42,6 +42,25 @@ def test_orthogonality_energy_looks_at_the_smaller_side():
     assert float(orthogonality_energy(torch.zeros(2, 2))) == 2
 
 
+@pytest.mark.parametrize(("kx", "ky"), [(4, 3), (3, 4)])
+def test_batches_and_padding(kx, ky):
+    fmap, f, g = noise(5, ky, kx), noise(5, kx, 2, seed=1), noise(5, ky, 2, seed=2)
+    mu, lam = noise(5, kx, seed=3), noise(5, ky, seed=4)
+    for batch, alone in (
+        (descriptor_energy(fmap, f, g), lambda b: descriptor_energy(fmap[b], f[b], g[b])),
+        (commutativity_energy(fmap, mu, lam), lambda b: commutativity_energy(fmap[b], mu[b], lam[b])),
+        (orthogonality_energy(fmap), lambda b: orthogonality_energy(fmap[b])),
+    ):
+        torch.testing.assert_close(batch, torch.stack([alone(b) for b in range(5)]))
+    real_x, real_y = torch.tensor([kx, 2, 1, 3, 2]), torch.tensor([ky, 3, 2, 1, 2])  # either side may be the smaller
+    mask_x, mask_y = torch.arange(kx) < real_x[:, None], torch.arange(ky) < real_y[:, None]
+    padded = fmap * mask_x[:, None] * mask_y[..., None]
+    alone = [orthogonality_energy(fmap[b, : real_y[b], : real_x[b]]) for b in range(5)]
+    torch.testing.assert_close(orthogonality_energy(padded, mask_x, mask_y), torch.stack(alone))
+    one_side = orthogonality_energy(fmap * mask_x[:, None], mask_x)
+    torch.testing.assert_close(one_side[1], orthogonality_energy(fmap[1, :, :2]))
+
+
 def test_an_isometry_has_no_energy(mirror_blob):
     basis = basis_of(mirror_blob.mesh, 20)
     copy = renumbered(mirror_blob, 20)

@@ -7,8 +7,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from references import loss_layers as twin
+from references.shapes import basis_of, renumbered
 from references.unchecked import unchecked
 
+from torchqm.fmap import p2p_to_fmap
 from torchqm.fmap.orbit_loss import (
     assignment_orbit_loss,
     distance_orbit_loss,
@@ -18,6 +20,7 @@ from torchqm.fmap.orbit_loss import (
 from torchqm.fmap.orbit_truth import orbit_members
 from torchqm.fmap.soft import soft_map
 from torchqm.spectral import SoftMap
+from torchqm.symmetry import symmetrized_basis
 from torchqm.testing import gradcheck64
 
 TABLES = {"D3": twin.dihedral(3), "D4": twin.dihedral(4), "C4": twin.cyclic(4), "C5": twin.cyclic(5)}
@@ -138,6 +141,18 @@ def test_the_map_form_wants_one_element_for_all_points():
     assert distance_orbit_loss(image, truth, table, dist).item() == 0
     assert map_orbit_loss(image, truth, table, temperature=0.0).item() > 1
     assert map_orbit_loss(image, truth, table, dist, temperature=0.0).item() > 0.01
+
+
+def test_the_even_map_of_an_isometry(mirror_blob):
+    """On a real shape: zero for the truth and for its mirror image, not for a map that is off."""
+    copy = renumbered(mirror_blob, 20)
+    even_x = symmetrized_basis(basis_of(mirror_blob.mesh, 20), mirror_blob.group).even
+    even_y = symmetrized_basis(copy.basis, copy.shape.group).even
+    fmap = p2p_to_fmap(copy.p2p_yx, even_x, even_y)
+    for truth in copy.shape.group.maps[:, copy.p2p_xy]:
+        assert spectral_orbit_loss(fmap, even_x.evecs, even_y.evecs, truth, even_x.mass).item() < 1e-20
+    wrong = copy.p2p_xy.roll(1)
+    assert spectral_orbit_loss(fmap, even_x.evecs, even_y.evecs, wrong, even_x.mass).item() > 0.1
 
 
 def test_a_fixed_point_counts_once():

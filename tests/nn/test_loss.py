@@ -134,7 +134,7 @@ make = torch.Generator().manual_seed(0)
 def noise(*shape):
     return torch.randn(*shape, generator=make, dtype=torch.float64)
 
-table = torch.stack([twin.dihedral(2, s) for s in (0, 1)])
+table = torch.stack([twin.cyclic(2, s) for s in (0, 1)])
 b, v, k = 2, table.shape[-1], 4
 x, y, c, mass, evals, dist = noise(b, v, k), noise(b, v, k), noise(b, k, k), noise(b, v), noise(b, k), noise(b, v, v)
 truth = torch.randint(-1, v, (b, v), generator=make)
@@ -147,7 +147,7 @@ def gradients(fn):
     return loss.detach(), *torch.autograd.grad(loss.sum(), leaves)
 
 expected = gradients(layer)
-torch.testing.assert_close(gradients(torch.compile(layer, fullgraph=True, backend="aot_eager")), expected)
+torch.testing.assert_close(gradients(torch.compile(layer, fullgraph=True, backend="eager")), expected)
 exported = torch.export.export(layer, (x, y, c, *rest))
 torch.testing.assert_close(exported.module()(x, y, c, *rest), expected[0])
 alone = [layer(*(t[i] for t in (x, y, c, *rest))) for i in range(b)]

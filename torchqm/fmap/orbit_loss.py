@@ -13,14 +13,17 @@ from torch import Tensor
 from torchqm.checks import Sizes, require_finite
 from torchqm.fmap.orbit_terms import (
     Soft,
+    bind_distances,
+    bind_points,
     bind_soft,
     distances_at,
     negative_log_mass,
+    require_eps,
     rows_at,
     rows_of_samples,
     values_of,
 )
-from torchqm.fmap.orbit_truth import images_of, orbit_members, point_weights, soft_minimum
+from torchqm.fmap.orbit_truth import images_of, orbit_members, soft_minimum
 from torchqm.fmap.tables import check_group, require_ids, require_weights
 from torchqm.spectral.soft_map import SoftMap
 
@@ -73,7 +76,7 @@ def spectral_orbit_loss(
     sizes.bind("evecs_even_y", evecs_even_y, "... Y Ky")
     for name, value in (("fmap_even", fmap_even), ("evecs_even_x", evecs_even_x), ("evecs_even_y", evecs_even_y)):
         require_finite(name, value)
-    weights = _weights(sizes, fmap_even, p2p_xy, mass_x, samples, truth_mask)
+    weights = bind_points(sizes, fmap_even, p2p_xy, mass_x, samples, truth_mask)
     if samples is not None:
         require_ids("samples", samples, sizes["X"])
         evecs_even_x = rows_at(evecs_even_x, samples)
@@ -126,10 +129,10 @@ def assignment_orbit_loss(
         >>> assignment_orbit_loss(uniform, torch.tensor([0, -1, 2]), mirror).mul(100).round().item()  # -log(2 / 3)
         41.0
     """
-    _require_eps(eps)
+    require_eps(eps)
     sizes = bind_soft(soft_xy, log_weights)
     sizes.bind("group_y", group_y, "... G Y")
-    weights = _weights(sizes, values_of(soft_xy), p2p_xy, mass_x, samples, truth_mask)
+    weights = bind_points(sizes, values_of(soft_xy), p2p_xy, mass_x, samples, truth_mask)
     members = orbit_members(p2p_xy, group_y, group_mask)
     soft = rows_of_samples(soft_xy, samples, sizes)
     losses = negative_log_mass(soft, members[..., None, :], log_weights, eps)[..., 0]
@@ -175,7 +178,7 @@ def distance_orbit_loss(
         tensor(0.3333)
     """
     sizes = bind_soft(soft_xy)
-    weights = _weights(sizes, values_of(soft_xy), p2p_xy, mass_x, samples, truth_mask)
+    weights = bind_points(sizes, values_of(soft_xy), p2p_xy, mass_x, samples, truth_mask)
     if (dist_y is None) == (orbit_dist is None):
         raise ValueError("dist_y, orbit_dist: exactly one of them must be given")
     soft = rows_of_samples(soft_xy, samples, sizes)
@@ -187,7 +190,7 @@ def distance_orbit_loss(
     else:
         if group_y is None or dist_y is None:
             raise ValueError("group_y: must be given with dist_y")
-        _check_distances(sizes, dist_y, group_y)
+        bind_distances(sizes, dist_y, group_y)
         members = orbit_members(p2p_xy, group_y, group_mask)
         # What is left over repeats a member, which changes no minimum.
         members = torch.where(members < 0, members[..., :1].clamp_min(0), members)
@@ -243,12 +246,12 @@ def map_orbit_loss(
         >>> map_orbit_loss(flipped, torch.tensor([0, 1, 2]), mirror, temperature=0.0).item()
         0.0
     """
-    _require_eps(eps)
+    require_eps(eps)
     if log_weights and dist_y is not None:
         raise ValueError("log_weights: distances need the weights themselves")
     sizes = bind_soft(soft_xy, log_weights)
     sizes.bind("group_y", group_y, "... G Y")
-    weights = _weights(sizes, values_of(soft_xy), p2p_xy, mass_x, samples, truth_mask)
+    weights = bind_points(sizes, values_of(soft_xy), p2p_xy, mass_x, samples, truth_mask)
     check_group("group_y", group_y, group_mask)
     require_ids("p2p_xy", p2p_xy, sizes["Y"], none=True)
     images = images_of(p2p_xy, group_y)
@@ -256,40 +259,10 @@ def map_orbit_loss(
     if dist_y is None:
         losses = (weights[..., None] * negative_log_mass(soft, images[..., None], log_weights, eps)).sum(-2)
     else:
-        _check_distances(sizes, dist_y, group_y)
+        bind_distances(sizes, dist_y, group_y)
         per_element = [
             (weights * (values_of(soft) * distances_at(dist_y, images[..., g], soft).square()).sum(-1)).sum(-1)
             for g in range(images.shape[-1])
         ]
         losses = torch.stack(per_element, -1)
     return soft_minimum(losses, temperature, group_mask)
-
-
-def _weights(
-    sizes: Sizes,
-    like: Tensor,
-    p2p_xy: Tensor,
-    mass_x: Tensor | None,
-    samples: Tensor | None,
-    truth_mask: Tensor | None,
-) -> Tensor:
-    sizes.bind("p2p_xy", p2p_xy, "... N" if samples is not None else "... X")
-    if samples is not None:
-        sizes.bind("samples", samples, "... N")
-    if truth_mask is not None:
-        sizes.bind("truth_mask", truth_mask, "... N" if samples is not None else "... X")
-    if mass_x is not None:
-        sizes.bind("mass_x", mass_x, "... X")
-    require_ids("p2p_xy", p2p_xy, sizes["Y"], none=True)
-    return point_weights(p2p_xy, like, mass_x, samples, truth_mask)
-
-
-def _check_distances(sizes: Sizes, dist_y: Tensor, group_y: Tensor) -> None:
-    sizes.bind("dist_y", dist_y, "... Y Y")
-    sizes.bind("group_y", group_y, "... G Y")
-    require_weights("dist_y", dist_y)
-
-
-def _require_eps(eps: float) -> None:
-    if not 0 < eps < 1:
-        raise ValueError(f"eps: {eps} given, expected a number between 0 and 1")

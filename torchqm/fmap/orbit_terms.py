@@ -5,10 +5,22 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchqm.checks import Sizes
+from torchqm.fmap.orbit_truth import point_weights
 from torchqm.fmap.tables import require_ids, require_weights
 from torchqm.spectral.soft_map import SoftMap
 
-__all__ = ["Soft", "bind_soft", "distances_at", "negative_log_mass", "rows_at", "rows_of_samples", "values_of"]
+__all__ = [
+    "Soft",
+    "bind_distances",
+    "bind_points",
+    "bind_soft",
+    "distances_at",
+    "negative_log_mass",
+    "require_eps",
+    "rows_at",
+    "rows_of_samples",
+    "values_of",
+]
 
 Soft = SoftMap | Float[Tensor, "*B X Y"]
 AnyRows = SoftMap | Tensor
@@ -77,3 +89,36 @@ def bind_soft(soft_xy: Soft, log_weights: bool = False) -> Sizes:
         sizes.bind("soft_xy", soft_xy, "... X Y")
     require_weights("soft_xy", values_of(soft_xy), log_weights)
     return sizes
+
+
+def bind_points(
+    sizes: Sizes,
+    like: Tensor,
+    p2p_xy: Tensor,
+    mass_x: Tensor | None,
+    samples: Tensor | None,
+    truth_mask: Tensor | None,
+) -> Tensor:
+    """Check the true points and what belongs to them; their weights."""
+    sizes.bind("p2p_xy", p2p_xy, "... N" if samples is not None else "... X")
+    if samples is not None:
+        sizes.bind("samples", samples, "... N")
+    if truth_mask is not None:
+        sizes.bind("truth_mask", truth_mask, "... N" if samples is not None else "... X")
+    if mass_x is not None:
+        sizes.bind("mass_x", mass_x, "... X")
+    require_ids("p2p_xy", p2p_xy, sizes["Y"], none=True)
+    return point_weights(p2p_xy, like, mass_x, samples, truth_mask)
+
+
+def bind_distances(sizes: Sizes, dist_y: Tensor, group_y: Tensor) -> None:
+    """Check a table of distances."""
+    sizes.bind("dist_y", dist_y, "... Y Y")
+    sizes.bind("group_y", group_y, "... G Y")
+    require_weights("dist_y", dist_y)
+
+
+def require_eps(eps: float) -> None:
+    """Raise ``ValueError`` unless ``eps`` is a floor of weights."""
+    if not 0 < eps < 1:
+        raise ValueError(f"eps: {eps} given, expected a number between 0 and 1")

@@ -1,21 +1,17 @@
 """Soft point maps from features: a softmax over the vertices of the target, or over the k best of them only."""
 
-from collections.abc import Callable
-from typing import Any
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchqm.checks import Sizes, enabled, require_finite, require_mask
+from torchqm.fmap.pair_products import PairProducts, at_neighbours, by_blocks, rows_at_once
 from torchqm.fmap.tables import require_ids
 from torchqm.spectral.soft_map import SoftMap
 
 __all__ = ["feature_neighbours", "soft_assignment", "soft_map"]
 
 KINDS = ("dot", "distance")
-BLOCK = 2**22
-"""Entries of the largest tensor made for some rows of a sparse map: 16 MiB in float32."""
 
 
 def soft_assignment(log_alpha: Float[Tensor, "..."], tau: float = 0.2, dim: int = -1, hard: bool = False) -> Tensor:
@@ -116,12 +112,12 @@ def soft_map(
         weights = torch.softmax(logits, -1)
         return weights if real is None else weights * real[..., None]
     indices = _best(feat_x.detach(), feat_y.detach(), bias, mask_y, k, include, chunk)
-    logits = _Products.apply(feat_x, feat_y, indices, chunk)
+    logits = PairProducts.apply(feat_x, feat_y, indices, chunk)
     if bias is not None:
-        logits = logits + _at(bias, indices)
+        logits = logits + at_neighbours(bias, indices)
     logits = logits * factor
     if mask_y is not None:
-        kept = _at(mask_y, indices)
+        kept = at_neighbours(mask_y, indices)
         logits = logits.masked_fill(~kept, torch.finfo(logits.dtype).min)
         indices = torch.where(kept, indices, indices[..., :1])
     weights = torch.softmax(logits, -1)
@@ -149,74 +145,6 @@ def feature_neighbours(
         return _best(feat_x, feat_y, bias, mask_y, k, None, chunk)
 
 
-class _Products(torch.autograd.Function):
-    """``<f_x, f_y>`` for the given pairs, some rows at a time; the backward pass can be differentiated again."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(feat_x: Tensor, feat_y: Tensor, indices: Tensor, chunk: int | None) -> Tensor:
-        rows = _rows(indices, indices.shape[-1] * feat_x.shape[-1], chunk)
-
-        def block(at: slice) -> Tensor:
-            return (_taken(feat_y, indices[..., at, :]) @ feat_x[..., at, :, None])[..., 0]
-
-        return _by_blocks(block, feat_x.shape[-2], rows)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor, int | None], output: Tensor) -> None:
-        feat_x, feat_y, indices, chunk = inputs
-        ctx.save_for_backward(feat_x, feat_y, indices)
-        ctx.chunk = chunk
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
-        feat_x, feat_y, indices = ctx.saved_tensors
-        rows, n = _rows(indices, indices.shape[-1] * feat_x.shape[-1], ctx.chunk), feat_x.shape[-2]
-        grad, grad_x, grad_y = grads[0], None, None
-
-        def block(at: slice) -> Tensor:
-            return (grad[..., at, None, :] @ _taken(feat_y, indices[..., at, :]))[..., 0, :]
-
-        if ctx.needs_input_grad[0]:
-            grad_x = _by_blocks(block, n, rows)
-        if ctx.needs_input_grad[1]:
-            grad_y = torch.zeros_like(feat_y)
-            for start in range(0, n, rows):
-                at = slice(start, start + rows)
-                outer = (grad[..., at, :, None] * feat_x[..., at, None, :]).flatten(-3, -2)
-                ids = indices[..., at, :].flatten(-2)[..., None]
-                grad_y = grad_y.scatter_add(-2, ids.expand(*ids.shape[:-1], feat_y.shape[-1]), outer)
-        return grad_x, grad_y, None, None
-
-
-def _by_blocks(block: Callable[[slice], Tensor], n: int, rows: int) -> Tensor:
-    """``block`` of some rows at a time, all results in one tensor made in time.
-
-    Small results that live on between large blocks that come and go would split the memory these leave: allocators
-    then take new memory for each block, as much as the matrix that is not to be made.
-    """
-    first = block(slice(0, rows))
-    if rows >= n:
-        return first
-    out = first[..., :1, :].expand(*first.shape[:-2], n, first.shape[-1]).clone()  # a batch under vmap, as first is
-    out[..., :rows, :] = first
-    for start in range(rows, n, rows):
-        out[..., start : start + rows, :] = block(slice(start, start + rows))
-    return out
-
-
-def _taken(feat_y: Tensor, ids: Tensor) -> Tensor:
-    """``(..., R, k, C)``: the features of the neighbours of R rows."""
-    flat = ids.flatten(-2)[..., None].expand(*ids.shape[:-2], -1, feat_y.shape[-1])
-    return torch.gather(feat_y, -2, flat).unflatten(-2, ids.shape[-2:])
-
-
-def _at(values: Tensor, indices: Tensor) -> Tensor:
-    """``values (..., Y)`` at ``indices (..., X, k)``."""
-    return torch.gather(values, -1, indices.flatten(-2)).unflatten(-1, indices.shape[-2:])
-
-
 def _best(
     feat_x: Tensor,
     feat_y: Tensor,
@@ -241,15 +169,15 @@ def _best(
             scores = scores.scatter_reduce(-1, wanted.clamp_min(0), raised, "amax")
         return scores.topk(k, -1).indices
 
-    best = _by_blocks(block, feat_x.shape[-2], _rows(feat_x, feat_y.shape[-2], chunk))
+    best = by_blocks(block, feat_x.shape[-2], rows_at_once(feat_x, feat_y.shape[-2], chunk))
     if include is None:
         return best
     # Those that were to be kept came first; the order is by similarity again.
-    logits = _Products.apply(feat_x, feat_y, best, chunk)
+    logits = PairProducts.apply(feat_x, feat_y, best, chunk)
     if bias is not None:
-        logits = logits + _at(bias.detach(), best)
+        logits = logits + at_neighbours(bias.detach(), best)
     if mask_y is not None:
-        logits = logits.masked_fill(~_at(mask_y, best), limits.min)
+        logits = logits.masked_fill(~at_neighbours(mask_y, best), limits.min)
     return torch.gather(best, -1, logits.argsort(-1, descending=True))
 
 
@@ -272,13 +200,6 @@ def _unit(values: Tensor) -> Tensor:
     squares = values.square().sum(-1, keepdim=True)
     empty = squares == 0
     return values * torch.where(empty, 0.0, torch.where(empty, 1.0, squares).rsqrt())
-
-
-def _rows(tensor: Tensor, entries: int, chunk: int | None) -> int:
-    """How many rows are taken at once if one row of one shape in the batch makes this many entries."""
-    if chunk is not None:
-        return chunk
-    return max(1, BLOCK // max(1, tensor.shape[:-2].numel() * entries))
 
 
 def _require_tau(tau: float | Tensor) -> None:

@@ -30,7 +30,7 @@ def check_group(name: str, group: Tensor, mask: Tensor | None, mask_name: str = 
 
 def require_ids(name: str, ids: Tensor, n: int, none: bool = False) -> None:
     """Raise ``ValueError`` where an id lies outside ``0..n-1``; with ``none``, -1 is allowed, too."""
-    if ids.is_floating_point() or ids.is_complex() or ids.dtype == torch.bool:
+    if ids.dtype != torch.int64:
         raise ValueError(f"{name}: dtype {ids.dtype} given, expected vertex ids (torch.int64)")
     if not enabled() or not ids.numel():
         return
