@@ -26,6 +26,9 @@ K_CHOICE = 100
 AGREEMENT = 0.9
 """Share of the shape, weighted by the distance of mirror images, on which odd block and neighbours must agree."""
 
+CLEARLY = 0.97
+"""Share of the best other score that a synchronized candidate must stay below: the odd block has more evidence."""
+
 FIRST_STEPS = 3
 """Two-way steps at the first size: more of them spread errors of the first map, instead of mending them."""
 
@@ -94,7 +97,7 @@ def full_map_from_blocks(
     smaller = parameters.changed(k_max=max(parameters.k, min(K_CHOICE, parameters.k_max)))
     found = [replace(f, fmap=refine_fmap(f.fmap, x, y, smaller, few)) for f in found]
     scores = tuple(_score(f.fmap, x, y) for f in found)
-    best = found[scores.index(min(scores))]
+    best = found[min(range(len(found)), key=lambda i: scores[i] / (CLEARLY if found[i].synchronized else 1))]
     return replace(best, fmap=refine_fmap(best.fmap, x, y, parameters, places), scores=scores)
 
 
