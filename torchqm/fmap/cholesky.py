@@ -27,7 +27,7 @@ def factorize(gram: Tensor, diagonal: Tensor, out: Tensor) -> Tensor:
         out: ``(R, n, K, K)``, contiguous; its upper triangles are not written.
     """
     r, n, k = diagonal.shape
-    panel = k if k <= _SMALL or gram.device.type != "cpu" else _PANEL
+    panel = max(k, 1) if k <= _SMALL or gram.device.type != "cpu" else _PANEL
     lower, failed = out.view(r * n, k, k), torch.zeros(r * n, dtype=torch.bool, device=gram.device)
     for j in range(0, k, panel):
         end = min(j + panel, k)
@@ -56,15 +56,16 @@ def solve_factored(lower: Tensor, columns: Tensor) -> Tensor:
 def solve_checked(lower: Tensor, rhs: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
     """The rows, and which systems are singular to working precision.
 
-    Scaled to a diagonal of ones (``unit`` is the root of the old one), a system applied backwards to vectors of signs
-    makes them about as long as 1 / its smallest eigenvalue. If that is what rounding leaves of zero, the solution is
-    noise. Pivots alone do not show it: they can be a million times as large.
+    Scaled to a diagonal of ones (``unit`` is the root of the old one), a system applied backwards twice to any vector
+    shows its smallest eigenvalue. If that is what rounding leaves of zero, the solution is noise. Pivots alone do not
+    show it: they can be a million times as large.
     """
     k = rhs.shape[-1]
-    place = torch.arange(k, device=rhs.device, dtype=rhs.dtype)[:, None] + 0.5
-    columns = unit[..., None]
-    signs = torch.where(torch.cat([place.square(), 2 * place.square()], -1).cos() > 0, columns, -columns)
-    solved = solve_factored(lower, torch.cat([rhs[..., None], signs], -1))
-    longest = (columns * solved[..., 1:]).square().sum(-2).amax(-1).sqrt()
+    place = torch.arange(k, device=rhs.device, dtype=rhs.dtype) + 0.5
+    signs = torch.where(place.square().cos() > 0, unit, -unit)
+    solved = solve_factored(lower, torch.stack([rhs, signs], -1))
+    once = unit * solved[..., 1]
+    once = once / once.abs().amax(-1, keepdim=True)  # its square could overflow
+    twice = unit * solve_factored(lower, (unit * once)[..., None])[..., 0]
     noise = 8 * k**0.5 * torch.finfo(rhs.dtype).eps
-    return solved[..., 0], ~(longest * noise < 1)
+    return solved[..., 0], ~(noise * twice.norm(dim=-1) < once.norm(dim=-1))

@@ -80,6 +80,7 @@ def solve_rows(
     """
     sizes = Sizes()
     sizes.bind("gram", gram, "... Kx Kx")
+    sizes.bind("gram", gram.mT, "... Kx Kx")
     sizes.bind("diagonal", diagonal, "... Ky Kx")
     sizes.bind("rhs", rhs, "... Ky Kx")
     if row_chunk is not None and row_chunk < 1:
@@ -96,6 +97,8 @@ def _solve_rows(
     """The rows, and the factor ``(Ky, samples, Kx, Kx)``, empty unless kept; rows first: chunks lie together."""
     ky, kx = rhs.shape[-2:]
     n = prod(rhs.shape[:-2])
+    if rhs.numel() == 0:
+        return rhs.clone(), gram.new_empty((ky, n, kx, kx) if keep else 0)
     systems = gram.reshape(n, kx, kx)
     entries, right = (side.reshape(n, ky, kx).transpose(0, 1) for side in (diagonal, rhs))
     step = rows_at_once(gram, n, row_chunk or ky)
@@ -127,6 +130,8 @@ def _solve_rows_again(rhs: Tensor, factor: Tensor) -> Tensor:
     """The same systems with other right-hand sides."""
     ky, kx = rhs.shape[-2:]
     n = factor.shape[1]
+    if rhs.numel() == 0:
+        return rhs.clone()
     right = rhs.reshape(n, ky, kx).transpose(0, 1)[..., None]
     rows = rhs.new_empty(ky, n, kx)
     step = rows_at_once(rhs, n, ky)
