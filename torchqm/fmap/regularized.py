@@ -225,7 +225,7 @@ def _minimum(
         diagonal = torch.where(evals_mask_x[..., None, :], diagonal, energy.detach())
     if evals_mask_y is not None:
         diagonal = torch.where(evals_mask_y[..., :, None], diagonal, energy.detach())
-    return solve_rows(gram, diagonal, coeffs_y @ weighted.mT, row_chunk)
+    return solve_rows(gram, diagonal.to(gram.dtype), coeffs_y @ weighted.mT, row_chunk)
 
 
 def _weighted(coeffs: Tensor, weights: Tensor | None, sample_weights: Tensor | None, sizes: Sizes) -> Tensor:
@@ -233,11 +233,11 @@ def _weighted(coeffs: Tensor, weights: Tensor | None, sample_weights: Tensor | N
     if weights is not None:
         sizes.bind("weights", weights, "C" if weights.ndim == 1 else "... C")
         require_nonnegative("weights", weights)
-        coeffs = coeffs * weights[..., None, :]
+        coeffs = coeffs * weights[..., None, :].to(coeffs.dtype)
     if sample_weights is not None:
         sizes.bind("sample_weights", sample_weights[..., None], "... 1")
         require_nonnegative("sample_weights", sample_weights)
-        coeffs = coeffs * sample_weights[..., None, None]
+        coeffs = coeffs * sample_weights[..., None, None].to(coeffs.dtype)
     return coeffs
 
 

@@ -14,14 +14,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchqm.checks import Sizes
+from torchqm.fmap.cholesky import factorize, rows_at_once, solve_checked, solve_factored
 
 __all__ = ["UndeterminedRowsError", "solve_rows"]
-
-# Columns that LAPACK factors at once on the CPU, the rest is matrix products; below _SMALL it does a whole system.
-# Measured at 100 x 100: 2.2 times as fast as LAPACK alone.
-_PANEL, _SMALL = 16, 32
-# Numbers in the systems that are factored together: on the CPU what its caches hold, on a GPU what keeps it busy.
-_AT_ONCE = {"cpu": 2**20, "gpu": 2**26}
 
 
 class UndeterminedRowsError(ValueError):
@@ -79,52 +74,54 @@ def solve_rows(
             (about ``8 sqrt(Kx) eps``, with its diagonal scaled to ones).
 
     Example:
-        >>> gram, diagonal = torch.eye(2), torch.tensor([[0.0, 1.0], [1.0, 3.0]])
+        >>> gram, diagonal = torch.eye(2), torch.tensor([[0.0, 3.0], [3.0, 15.0]])
         >>> solve_rows(gram, diagonal, torch.ones(2, 2)).tolist()
-        [[1.0, 0.5], [0.5, 0.25]]
+        [[1.0, 0.25], [0.25, 0.0625]]
     """
     sizes = Sizes()
     sizes.bind("gram", gram, "... Kx Kx")
+    sizes.bind("gram", gram.mT, "... Kx Kx")
     sizes.bind("diagonal", diagonal, "... Ky Kx")
     sizes.bind("rhs", rhs, "... Ky Kx")
     if row_chunk is not None and row_chunk < 1:
         raise ValueError(f"row_chunk is {row_chunk}; allowed are None and whole numbers from 1")
     tracked = gram.requires_grad or diagonal.requires_grad or rhs.requires_grad
     keep = row_chunk is None and tracked and torch.is_grad_enabled()
-    return _Solve.apply(gram, diagonal, rhs, row_chunk or 0, keep)[0]
+    return _Solve.apply(gram, diagonal, rhs, row_chunk or 0, keep, True)[0]
 
 
 @torch.library.custom_op("torchqm::solve_rows", mutates_args=())
-def _solve_rows(gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool) -> tuple[Tensor, Tensor]:
+def _solve_rows(
+    gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool, check: bool
+) -> tuple[Tensor, Tensor]:
     """The rows, and the factor ``(Ky, samples, Kx, Kx)``, empty unless kept; rows first: chunks lie together."""
     ky, kx = rhs.shape[-2:]
     n = prod(rhs.shape[:-2])
+    if rhs.numel() == 0:
+        return rhs.clone(), gram.new_empty((ky, n, kx, kx) if keep else 0)
     systems = gram.reshape(n, kx, kx)
     entries, right = (side.reshape(n, ky, kx).transpose(0, 1) for side in (diagonal, rhs))
-    limit = _AT_ONCE["cpu" if gram.device.type == "cpu" else "gpu"]
-    step = max(1, min(row_chunk or ky, limit // max(1, n * kx * kx)))
+    step = rows_at_once(gram, n, row_chunk or ky)
     factor = gram.new_empty((ky, n, kx, kx) if keep else 0)
     workspace = gram.new_empty((0 if keep else min(step, ky), n, kx, kx))
     rows = gram.new_empty(ky, n, kx)
-    probes, noise = _probes(gram), 8 * max(kx, 1) ** 0.5 * torch.finfo(gram.dtype).eps
-    singular = torch.zeros(ky, n, dtype=torch.bool, device=gram.device)
+    # Without a check, the same systems passed it before.
+    undetermined = torch.zeros(ky, n, dtype=torch.bool, device=gram.device)
     for start in range(0, ky, step):
         part = slice(start, start + step)
         lower = factor[part] if keep else workspace[: len(rows[part])]
-        failed = _factorize(systems, entries[part], lower)
-        # With a diagonal of ones, a system applied backwards to vectors of signs makes them as long as 1 / its smallest
-        # eigenvalue. If that is what rounding leaves of zero, the solution is noise. Pivots alone do not show it: they
-        # can be 1e6 times as large.
-        unit = (systems.diagonal(dim1=-2, dim2=-1) + entries[part]).clamp_min(0).sqrt()[..., None]
-        solved = _solve_factored(lower, torch.cat([right[part, ..., None], unit * probes], -1))
-        longest = (unit * solved[..., 1:]).square().sum(-2).amax(-1).sqrt()
-        singular[part] = failed | ~(longest * noise < 1)
-        rows[part] = solved[..., 0]
-    if bool(singular.any()):
+        failed = factorize(systems, entries[part], lower)
+        if check:
+            unit = (systems.diagonal(dim1=-2, dim2=-1) + entries[part]).clamp_min(0).sqrt()
+            rows[part], singular = solve_checked(lower, right[part], unit)
+            undetermined[part] = failed | singular
+        else:
+            rows[part] = solve_factored(lower, right[part, ..., None])[..., 0]
+    if check and bool(undetermined.any()):
         for name, values in (("descriptors", gram), ("lmbda and eigenvalues", diagonal)):
             if not bool(torch.isfinite(values).all()):
                 raise ValueError(f"the system made of the {name} has entries that are NaN or infinite")
-        raise UndeterminedRowsError(singular.T.reshape(rhs.shape[:-1]))
+        raise UndeterminedRowsError(undetermined.T.reshape(rhs.shape[:-1]))
     return rows.transpose(0, 1).reshape(rhs.shape).contiguous(), factor
 
 
@@ -132,53 +129,20 @@ def _solve_rows(gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, kee
 def _solve_rows_again(rhs: Tensor, factor: Tensor) -> Tensor:
     """The same systems with other right-hand sides."""
     ky, kx = rhs.shape[-2:]
-    right = rhs.reshape(prod(rhs.shape[:-2]), ky, kx).transpose(0, 1)[..., None]
-    return _solve_factored(factor, right)[..., 0].transpose(0, 1).reshape(rhs.shape).contiguous()
-
-
-def _factorize(gram: Tensor, diagonal: Tensor, out: Tensor) -> Tensor:
-    """Cholesky factors of ``gram + diag(diagonal)`` into the lower triangles of ``out``; which of them there are not.
-
-    Args:
-        gram: ``(n, K, K)``.
-        diagonal: ``(R, n, K)``.
-        out: ``(R, n, K, K)``, contiguous; its upper triangles are not written.
-    """
-    r, n, k = diagonal.shape
-    panel = k if k <= _SMALL or gram.device.type != "cpu" else _PANEL
-    lower, failed = out.view(r * n, k, k), torch.zeros(r * n, dtype=torch.bool, device=gram.device)
-    for j in range(0, k, panel):
-        end = min(j + panel, k)
-        # The columns j to end from the diagonal downwards, less what the columns before explain of them.
-        columns = gram[:, j:, j:end].expand(r, n, k - j, end - j).clone(memory_format=torch.contiguous_format)
-        columns = columns.view(r * n, k - j, end - j)
-        top = columns[:, : end - j]
-        top.diagonal(dim1=1, dim2=2).add_(diagonal[..., j:end].reshape(r * n, end - j))
-        if j:
-            columns.baddbmm_(lower[:, j:, :j], lower[:, j:end, :j].mT, alpha=-1)
-        corner, info = torch.linalg.cholesky_ex(top)
-        failed |= info > 0
-        lower[:, j:end, j:end] = corner
-        if end < k:
-            below = torch.linalg.solve_triangular(corner.mT, columns[:, end - j :], upper=True, left=False)
-            lower[:, end:, j:end] = below
-    return failed.view(r, n)
-
-
-def _solve_factored(lower: Tensor, columns: Tensor) -> Tensor:
-    half = torch.linalg.solve_triangular(lower, columns, upper=False)
-    return torch.linalg.solve_triangular(lower.mT, half, upper=True)
-
-
-def _probes(like: Tensor) -> Tensor:
-    """``(K, 3)`` signs without a pattern, the same in every call."""
-    place = torch.arange(like.shape[-1], device=like.device, dtype=like.dtype)[:, None] + 0.5
-    phases = place.square() * torch.arange(1, 4, device=like.device, dtype=like.dtype)
-    return torch.where(phases.cos() > 0, 1.0, -1.0).to(like.dtype)
+    n = factor.shape[1]
+    if rhs.numel() == 0:
+        return rhs.clone()
+    right = rhs.reshape(n, ky, kx).transpose(0, 1)[..., None]
+    rows = rhs.new_empty(ky, n, kx)
+    step = rows_at_once(rhs, n, ky)
+    for start in range(0, ky, step):  # what the first sweep has read, the second finds in the cache
+        part = slice(start, start + step)
+        rows[part] = solve_factored(factor[part], right[part])[..., 0]
+    return rows.transpose(0, 1).reshape(rhs.shape).contiguous()
 
 
 @_solve_rows.register_fake
-def _(gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool) -> tuple[Tensor, Tensor]:
+def _(gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool, check: bool) -> tuple[Tensor, Tensor]:
     ky, kx = rhs.shape[-2:]
     return rhs.new_empty(rhs.shape), rhs.new_empty((ky, prod(rhs.shape[:-2]), kx, kx) if keep else 0)
 
@@ -194,12 +158,14 @@ class _Solve(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool) -> tuple[Tensor, Tensor]:
-        return torch.ops.torchqm.solve_rows(gram, diagonal, rhs, row_chunk, keep)
+    def forward(
+        gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool, check: bool
+    ) -> tuple[Tensor, Tensor]:
+        return torch.ops.torchqm.solve_rows(gram, diagonal, rhs, row_chunk, keep, check)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-        gram, diagonal, _, ctx.row_chunk, ctx.keep = inputs
+        gram, diagonal, _, ctx.row_chunk, ctx.keep, _ = inputs
         ctx.mark_non_differentiable(output[1])
         ctx.set_materialize_grads(False)  # else autograd makes zeros as large as the factor
         ctx.save_for_backward(gram, diagonal, *output)
@@ -207,13 +173,13 @@ class _Solve(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor | None, _: Any) -> tuple[Tensor | None, ...]:
         if grad is None:
-            return None, None, None, None, None
+            return (None,) * 6
         gram, diagonal, rows, factor = ctx.saved_tensors
         if ctx.keep:
             u = _SolveAgain.apply(gram, diagonal, grad, factor)
         else:
-            u = _Solve.apply(gram, diagonal, grad, ctx.row_chunk, False)[0]
-        return *_gradients(rows, u), None, None
+            u = _Solve.apply(gram, diagonal, grad, ctx.row_chunk, False, False)[0]
+        return *_gradients(rows, u), None, None, None
 
 
 class _SolveAgain(torch.autograd.Function):
@@ -249,10 +215,10 @@ def _to_front(size: int, tensors: Sequence[Tensor], in_dims: Sequence[int | None
 
 @_solve_rows.register_vmap
 def _(
-    info: Any, in_dims: Any, gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool
+    info: Any, in_dims: Any, gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool, check: bool
 ) -> tuple[tuple[Tensor, Tensor], tuple[int, int | None]]:
     front = _to_front(info.batch_size, (gram, diagonal, rhs), in_dims[:3])
-    rows, factor = torch.ops.torchqm.solve_rows(*front, row_chunk, keep)
+    rows, factor = torch.ops.torchqm.solve_rows(*front, row_chunk, keep, check)
     if not keep:
         return (rows, factor), (0, None)
     return (rows, factor.unflatten(1, (info.batch_size, -1))), (0, 1)

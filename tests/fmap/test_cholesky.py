@@ -1,0 +1,58 @@
+"""torchqm.fmap.cholesky: factors in panels are LAPACK's, and only what is singular to rounding is called singular."""
+
+import pytest
+import torch
+
+from torchqm.fmap.cholesky import factorize, solve_checked
+
+
+def noise(*shape, seed=0, dtype=torch.float64):
+    return torch.randn(*shape, dtype=dtype, generator=torch.Generator().manual_seed(seed))
+
+
+def singular(gram, diagonal):
+    lower = gram.new_empty(*diagonal.shape, gram.shape[-1])
+    failed = factorize(gram, diagonal, lower)
+    unit = (gram.diagonal(dim1=1, dim2=2) + diagonal).sqrt()
+    return failed | solve_checked(lower, torch.ones_like(diagonal), unit)[1]
+
+
+@pytest.mark.parametrize("k", [1, 16, 33, 50])  # whole systems, one panel and a bit, panels that do not divide K
+def test_factors_are_those_of_lapack(k):
+    a = noise(2, k, k + 3)
+    gram, diagonal = a @ a.mT, noise(3, 2, k, seed=1).square()
+    before, lower = gram.clone(), torch.full((3, 2, k, k), torch.nan, dtype=torch.float64)
+    assert not factorize(gram, diagonal, lower).any()
+    systems = gram + torch.diag_embed(diagonal)
+    torch.testing.assert_close(lower.tril(), torch.linalg.cholesky(systems), atol=1e-12 * k, rtol=1e-12)
+    assert torch.equal(gram, before)  # also one row of one sample, where an expanded copy would be a view
+    one = torch.empty(1, 1, k, k, dtype=torch.float64)
+    factorize(gram[:1], diagonal[:1, :1], one)
+    assert torch.equal(gram, before)
+
+
+def test_an_indefinite_system_is_named():
+    gram = torch.eye(40, dtype=torch.float64)[None]
+    diagonal = torch.zeros(3, 1, 40, dtype=torch.float64)
+    diagonal[1, 0, 20] = -2  # in the second panel
+    assert factorize(gram, diagonal, torch.empty(3, 1, 40, 40, dtype=torch.float64)).flatten().tolist() == [0, 1, 0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("k", "c"), [(4, 20), (30, 64), (60, 256)])
+def test_one_missing_dimension_is_seen_whatever_the_scales(dtype, k, c):
+    """Also where all pivots are far above rounding, as with some of these seeds."""
+    scales = torch.logspace(0, -3, k, dtype=dtype)[:, None]
+    for seed in range(30):
+        a = noise(k, k - 1, seed=seed, dtype=dtype) @ noise(k - 1, c, seed=seed + 100, dtype=dtype) * scales
+        gram = (a @ a.T)[None]
+        assert singular(gram, torch.zeros(1, 1, k, dtype=dtype)).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_scales_alone_are_not_singular(dtype):
+    scales = torch.logspace(0, -12, 20, dtype=dtype)
+    a = noise(20, 60, dtype=dtype)
+    gram = (scales[:, None] * (a @ a.T) * scales)[None]
+    assert not singular(gram, torch.zeros(1, 1, 20, dtype=dtype)).any()
+    assert not singular(torch.zeros_like(gram), scales[None, None].square()).any()

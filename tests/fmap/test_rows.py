@@ -1,0 +1,172 @@
+"""torchqm.fmap.rows: against dense solves, derivatives of all orders, under torch.func, and what is kept in memory."""
+
+import pytest
+import torch
+from references.unchecked import unchecked
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from torchqm.fmap import rows as module
+from torchqm.fmap.rows import UndeterminedRowsError, solve_rows
+from torchqm.testing import gradcheck64
+
+
+def problem(*leading, kx=5, ky=4, c=7, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    shapes = ((*leading, kx, c), (*leading, ky, kx), (*leading, ky, kx))
+    a, d, r = (torch.randn(shape, generator=generator, dtype=torch.float64) for shape in shapes)
+    return a, d.square(), r
+
+
+def solve(a, diagonal, rhs, row_chunk=None):
+    return solve_rows(a @ a.mT, diagonal, rhs, row_chunk)
+
+
+@pytest.mark.parametrize("row_chunk", [None, 1, 3])
+@pytest.mark.parametrize(
+    ("leading", "kx", "ky"), [((), 5, 4), ((2,), 3, 7), ((2, 3), 4, 4), ((2,), 40, 5), ((2,), 4, 0)]
+)
+def test_as_dense_solves(leading, kx, ky, row_chunk):
+    a, d, r = problem(*leading, kx=kx, ky=ky, c=kx + 2)
+    a.requires_grad_()  # so that the factor is kept
+    systems = (a @ a.mT)[..., None, :, :] + torch.diag_embed(d)
+    torch.testing.assert_close(solve(a, d, r, row_chunk), torch.linalg.solve(systems, r), atol=1e-11, rtol=1e-10)
+
+
+def test_nothing_to_solve():
+    empty = torch.zeros(2, 0, 0)
+    assert solve_rows(empty, torch.zeros(2, 3, 0), torch.zeros(2, 3, 0)).shape == (2, 3, 0)
+
+
+@pytest.mark.parametrize("row_chunk", [None, 2])
+def test_gradients_and_their_gradients(row_chunk):
+    inputs = problem(2, kx=3, ky=3, c=4)
+    assert gradcheck64(lambda *given: solve(*given, row_chunk), *inputs)
+    tracked = [tensor.requires_grad_() for tensor in inputs]
+    assert torch.autograd.gradgradcheck(lambda *given: solve(*given, row_chunk), tracked)
+
+
+def test_the_gradient_of_a_symmetric_matrix_is_symmetric():
+    a, d, r = problem(2)
+    gram = (a @ a.mT).requires_grad_()
+    systems = ((gram + gram.mT) / 2)[..., None, :, :] + torch.diag_embed(d)
+    (expected,) = torch.autograd.grad(torch.linalg.solve(systems, r).square().sum(), gram)
+    (found,) = torch.autograd.grad(solve_rows(gram, d, r).square().sum(), gram)
+    torch.testing.assert_close(found, expected)
+
+
+def test_chunks_change_nothing():
+    inputs = [tensor.requires_grad_() for tensor in problem(2, kx=40, ky=7, c=50)]
+    weight = torch.randn(2, 7, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    found = []
+    for row_chunk in (None, 1, 3, 7, 100):
+        fmap = solve(*inputs, row_chunk)
+        found.append([fmap, *torch.autograd.grad(fmap, inputs, weight)])
+    for other in found[1:]:
+        for ours, first in zip(other, found[0], strict=True):
+            torch.testing.assert_close(ours, first, atol=1e-13, rtol=1e-13)
+
+
+@pytest.mark.parametrize("row_chunk", [None, 2])
+def test_under_transforms(row_chunk):
+    inputs = problem(3, 2)
+
+    def loss(*given):
+        return solve(*given, row_chunk).square().sum()
+
+    tracked = [tensor.clone().requires_grad_() for tensor in inputs]
+    expected = torch.autograd.grad(loss(*tracked), tracked)
+    each = torch.func.vmap(torch.func.grad(loss, (0, 1, 2)))(*inputs)
+    whole = torch.func.grad(lambda *given: torch.func.vmap(loss)(*given).sum(), (0, 1, 2))(*inputs)
+    for ours, others, wanted in zip(each, whole, expected, strict=True):
+        torch.testing.assert_close(ours, wanted)
+        torch.testing.assert_close(others, wanted)
+    # one system for several right-hand sides, the batch last
+    a, d, r = (tensor[0, 0] for tensor in inputs)
+    several = torch.stack([r, 2 * r, -r], -1)
+    rows = torch.func.vmap(lambda one: solve(a, d, one, row_chunk), in_dims=-1, out_dims=-1)(several)
+    torch.testing.assert_close(rows, solve(a, d, r)[..., None] * torch.tensor([1.0, 2, -1], dtype=torch.float64))
+    columns = torch.func.vmap(torch.func.grad(lambda one: loss(a, d, one)), in_dims=-1, out_dims=-1)(several)
+    torch.testing.assert_close(columns[..., 2], -torch.func.grad(lambda one: loss(a, d, one))(r))
+
+
+class Storages(TorchDispatchMode):
+    """Notes how much memory the results of all operations share, by address."""
+
+    def __init__(self):
+        super().__init__()
+        self.sizes = {}
+
+    def __torch_dispatch__(self, function, types, arguments=(), named=None):
+        result = function(*arguments, **(named or {}))
+        for leaf in tree_leaves(result):
+            if isinstance(leaf, torch.Tensor):
+                self.sizes[leaf.untyped_storage().data_ptr()] = leaf.untyped_storage().nbytes()
+        return result
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_the_factor_is_the_only_tensor_of_its_size(keep, monkeypatch):
+    """Neither pass makes another; without a backward pass, or in chunks, there is none."""
+    a, d, r = problem(2, kx=40, ky=60, c=50)
+    whole, gram = 8 * 2 * 60 * 40 * 40, a @ a.mT
+    monkeypatch.setattr("torchqm.fmap.cholesky._AT_ONCE", {"cpu": 2 * 5 * 40 * 40})
+    with Storages() as seen:
+        _, factor = module._solve_rows._init_fn(gram, d, r, 0, keep, True)
+    large = [size for size in seen.sizes.values() if size > whole / 10]
+    assert large == ([whole] if keep else [])
+    if keep:
+        with Storages() as seen:
+            module._solve_rows_again._init_fn(r, factor)
+        assert [size for size in seen.sizes.values() if size > whole / 10] == [whole]  # a view of the factor
+
+
+@pytest.mark.parametrize(("row_chunk", "tracked", "kept"), [(None, True, 1), (7, True, 0), (None, False, 0)])
+def test_what_the_backward_pass_keeps(row_chunk, tracked, kept):
+    a, d, r = problem(2, kx=10, ky=12, c=20)
+    sizes = []
+    with torch.autograd.graph.saved_tensors_hooks(lambda t: sizes.append(t.numel()) or t, lambda t: t):
+        solve_rows((a @ a.mT).requires_grad_(tracked), d, r, row_chunk)
+    assert sizes.count(2 * 12 * 10 * 10) == kept
+    assert all(size <= 2 * 12 * 10 for size in sizes if size != 2 * 12 * 10 * 10)
+
+
+def test_the_backward_pass_makes_nothing_of_that_size():
+    a, d, r = problem(2, kx=10, ky=12, c=20)
+    rows = solve_rows((a @ a.mT).requires_grad_(), d.requires_grad_(), r)
+    with Storages() as seen:
+        rows.square().sum().backward()
+    assert seen.sizes
+    assert max(seen.sizes.values()) < 8 * 2 * 12 * 10 * 10
+
+
+def test_undetermined_rows_are_named():
+    a, d, r = problem(3, kx=4, ky=3, c=2)  # two descriptors for four unknowns
+    d[0], d[1, :2], d[1, 2], d[2] = 1, 1, 0, 1
+    with pytest.raises(UndeterminedRowsError, match=r"leave row\(s\) \[2\] of sample 1 of the map") as info:
+        solve(a, d, r)
+    assert info.value.undetermined.nonzero().tolist() == [[1, 2]]
+    with pytest.raises(ValueError, match=r"leave row\(s\) \[2\] of the map"):
+        solve(a[1], d[1], r[1], 1)
+    with pytest.raises(ValueError, match=r"row\(s\) \[2\] of sample \(1, 0\)"):
+        solve(a[:, None], d[:, None], r[:, None])
+    with pytest.raises(ValueError, match=r"\[0, 1, 2\] of sample 0, .* of sample 2 of the map"):
+        torch.func.vmap(solve)(a, 0 * d, r)
+    with pytest.raises(ValueError, match="and rows of 1 more samples"):
+        solve(torch.cat([a, a[:1]]), torch.zeros(4, 3, 4).double(), torch.cat([r, r[:1]]))
+
+
+def test_refusals():
+    a, d, r = problem()
+    gram = a @ a.mT
+    call = unchecked(solve_rows)
+    with pytest.raises(ValueError, match=r"diagonal: shape \(4, 4\) given, expected \(Ky, Kx\) with Kx = 5 as in gram"):
+        call(gram, d[:, :4], r)
+    with pytest.raises(ValueError, match=r"gram: shape \(5, 4\)"):
+        call(gram[:4], d, r)  # seen transposed
+    with pytest.raises(ValueError, match="row_chunk is 0"):
+        call(gram, d, r, 0)
+    with pytest.raises(ValueError, match="descriptors has entries that are NaN"):
+        call(gram * torch.nan, d, r)
+    with pytest.raises(ValueError, match="lmbda and eigenvalues has entries that are NaN"):
+        call(gram, d * torch.inf, r)
