@@ -19,6 +19,8 @@ def test_letters_are_learned_and_compared():
         sizes.bind("verts", torch.zeros(50, 2), "V 3")
     with pytest.raises(ValueError, match=r"evals: shape \(\) given, expected \(..., K\)"):
         sizes.bind("evals", torch.zeros(()), "... K")
+    with pytest.raises(ValueError, match=r"gram: shape \(3, 4\) given, expected \(N, N\)"):
+        sizes.bind("gram", torch.zeros(3, 4), "N N")
     with pytest.raises(TypeError, match="faces: expected a tensor, got list"):
         sizes.bind("faces", [1, 2], "F 3")
 

@@ -11,7 +11,16 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-__all__ = ["Sizes", "disabled", "enabled", "require_finite", "require_mask", "require_nonnegative", "set_enabled"]
+__all__ = [
+    "Sizes",
+    "disabled",
+    "enabled",
+    "require_finite",
+    "require_mask",
+    "require_nonnegative",
+    "set_enabled",
+    "wanted",
+]
 
 _state = {"enabled": True}
 
@@ -19,6 +28,11 @@ _state = {"enabled": True}
 def enabled() -> bool:
     """Whether values are checked here and now."""
     return _state["enabled"] and not _values_unknown()
+
+
+def wanted() -> bool:
+    """Whether values are to be checked, by operators that see them in compiled code, too."""
+    return _state["enabled"]
 
 
 def set_enabled(on: bool) -> None:
@@ -91,10 +105,10 @@ class Sizes:
         own = shape[len(shape) - n :]
         front = shape[: len(shape) - n]
         fits = not open_front or self._leading is None or front == self._leading[0]
+        met: dict[str, int] = {}
         for letter, size in zip(letters, own, strict=True):
-            fits = fits and (
-                size == int(letter) if letter.isdigit() else self._known.get(letter, (size, ""))[0] == size
-            )
+            known = int(letter) if letter.isdigit() else self._known.get(letter, (met.setdefault(letter, size), ""))[0]
+            fits = fits and size == known
         if not fits:
             raise ValueError(f"{name}: shape {shape} given, expected {self._expected(words)}")
         if open_front and self._leading is None:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchqm.fmap.cholesky import factorize, solve_checked
+from torchqm.fmap.cholesky import factorize, solve_checked, surely_regular
 
 
 def noise(*shape, seed=0, dtype=torch.float64):
@@ -56,3 +56,30 @@ def test_scales_alone_are_not_singular(dtype):
     gram = (scales[:, None] * (a @ a.T) * scales)[None]
     assert not singular(gram, torch.zeros(1, 1, 20, dtype=dtype)).any()
     assert not singular(torch.zeros_like(gram), scales[None, None].square()).any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_one_eigenvalue_problem_speaks_for_all_rows(dtype):
+    """Regular with the least diagonal of all: then each row is, and no row is asked; else nothing is promised."""
+    a = noise(1, 12, 20, dtype=dtype)
+    rows = noise(9, 1, 12, seed=1, dtype=dtype).square()
+    assert surely_regular(a @ a.mT, rows.amin(0))
+    few = noise(1, 12, 8, dtype=dtype)  # rank 8
+    assert not surely_regular(few @ few.mT, torch.zeros_like(rows[0]))
+    assert surely_regular(few @ few.mT, torch.full_like(rows[0], 0.1))
+    assert not surely_regular(torch.zeros(1, 12, 12, dtype=dtype), torch.zeros_like(rows[0]))
+    assert not surely_regular(a @ a.mT * torch.nan, rows[0])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_least_diagonal_bounds_the_scaled_eigenvalues_of_all_rows(seed):
+    a = noise(1, 6, 7, seed=seed)
+    gram = a @ a.mT * noise(6, seed=seed + 10).exp()[:, None] * noise(6, seed=seed + 10).exp()
+    rows = noise(40, 1, 6, seed=seed + 20).square() * noise(40, 1, 1, seed=seed + 30).mul(3).exp()
+
+    def least(systems):
+        root = systems.diagonal(dim1=-2, dim2=-1).rsqrt()
+        return torch.linalg.eigvalsh(root[..., :, None] * systems * root[..., None, :])[..., 0]
+
+    bound = least(gram + torch.diag_embed(rows.amin(0)))
+    assert bool((least(gram + torch.diag_embed(rows)) >= bound - 1e-12).all())

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-__all__ = ["factorize", "rows_at_once", "solve_checked", "solve_factored"]
+__all__ = ["factorize", "rows_at_once", "solve_checked", "solve_factored", "surely_regular"]
 
 # Columns that LAPACK factors at once on the CPU, the rest is matrix products; below _SMALL it does a whole system.
 # Measured at 100 x 100: 2.2 times as fast as LAPACK alone.
@@ -53,6 +53,29 @@ def solve_factored(lower: Tensor, columns: Tensor) -> Tensor:
     return torch.linalg.solve_triangular(lower.mT, half, upper=True)
 
 
+def surely_regular(gram: Tensor, floor: Tensor) -> bool:
+    """Whether all systems are regular, by one eigenvalue problem a sample instead of one estimate a row.
+
+    With ``floor`` the least diagonal of all rows and ``M = gram + diag(floor)``, each system is M plus a diagonal that
+    is not negative; scaled to a diagonal of ones its least eigenvalue is at least that of M, scaled likewise, or 1.
+
+    Args:
+        gram: ``(n, K, K)``.
+        floor: ``(n, K)`` the least entries of the diagonals that are added.
+    """
+    least = gram + torch.diag_embed(floor)
+    unit = least.diagonal(dim1=-2, dim2=-1)
+    if not bool(torch.isfinite(least).all() & (unit > 0).all()):
+        return False
+    root = unit.rsqrt()
+    values = torch.linalg.eigvalsh(root[..., :, None] * least * root[..., None, :])
+    return bool((values[..., 0] > 4 * _noise(gram)).all())
+
+
+def _noise(systems: Tensor) -> float:
+    return 8 * systems.shape[-1] ** 0.5 * torch.finfo(systems.dtype).eps
+
+
 def solve_checked(lower: Tensor, rhs: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
     """The rows, and which systems are singular to working precision.
 
@@ -67,5 +90,4 @@ def solve_checked(lower: Tensor, rhs: Tensor, unit: Tensor) -> tuple[Tensor, Ten
     once = unit * solved[..., 1]
     once = once / once.abs().amax(-1, keepdim=True)  # its square could overflow
     twice = unit * solve_factored(lower, (unit * once)[..., None])[..., 0]
-    noise = 8 * k**0.5 * torch.finfo(rhs.dtype).eps
-    return solved[..., 0], ~(noise * twice.norm(dim=-1) < once.norm(dim=-1))
+    return solved[..., 0], ~(_noise(lower) * twice.norm(dim=-1) < once.norm(dim=-1))

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchqm.checks import Sizes
-from torchqm.fmap.cholesky import factorize, rows_at_once, solve_checked, solve_factored
+from torchqm.checks import Sizes, wanted
+from torchqm.fmap.cholesky import factorize, rows_at_once, solve_checked, solve_factored, surely_regular
 
 __all__ = ["UndeterminedRowsError", "solve_rows"]
 
@@ -71,7 +71,8 @@ def solve_rows(
     Raises:
         ValueError: shapes that do not fit, ``row_chunk < 1``, or entries that are not finite;
             :class:`UndeterminedRowsError` (a ``ValueError``) where a system is singular to the precision of its dtype
-            (about ``8 sqrt(Kx) eps``, with its diagonal scaled to ones).
+            (about ``8 sqrt(Kx) eps``, with its diagonal scaled to ones); inside
+            :func:`torchqm.checks.disabled` only where its factor does not exist.
 
     Example:
         >>> gram, diagonal = torch.eye(2), torch.tensor([[0.0, 3.0], [3.0, 15.0]])
@@ -80,14 +81,13 @@ def solve_rows(
     """
     sizes = Sizes()
     sizes.bind("gram", gram, "... Kx Kx")
-    sizes.bind("gram", gram.mT, "... Kx Kx")
     sizes.bind("diagonal", diagonal, "... Ky Kx")
     sizes.bind("rhs", rhs, "... Ky Kx")
     if row_chunk is not None and row_chunk < 1:
         raise ValueError(f"row_chunk is {row_chunk}; allowed are None and whole numbers from 1")
     tracked = gram.requires_grad or diagonal.requires_grad or rhs.requires_grad
     keep = row_chunk is None and tracked and torch.is_grad_enabled()
-    return _Solve.apply(gram, diagonal, rhs, row_chunk or 0, keep, True)[0]
+    return _Solve.apply(gram, diagonal, rhs, row_chunk or 0, keep, wanted())[0]
 
 
 @torch.library.custom_op("torchqm::solve_rows", mutates_args=())
@@ -105,7 +105,8 @@ def _solve_rows(
     factor = gram.new_empty((ky, n, kx, kx) if keep else 0)
     workspace = gram.new_empty((0 if keep else min(step, ky), n, kx, kx))
     rows = gram.new_empty(ky, n, kx)
-    # Without a check, the same systems passed it before.
+    check = check and not surely_regular(systems, entries.amin(0))
+    # Without a check only those are found whose factor does not exist.
     undetermined = torch.zeros(ky, n, dtype=torch.bool, device=gram.device)
     for start in range(0, ky, step):
         part = slice(start, start + step)
@@ -117,7 +118,8 @@ def _solve_rows(
             undetermined[part] = failed | singular
         else:
             rows[part] = solve_factored(lower, right[part, ..., None])[..., 0]
-    if check and bool(undetermined.any()):
+            undetermined[part] = failed
+    if bool(undetermined.any()):
         for name, values in (("descriptors", gram), ("lmbda and eigenvalues", diagonal)):
             if not bool(torch.isfinite(values).all()):
                 raise ValueError(f"the system made of the {name} has entries that are NaN or infinite")
