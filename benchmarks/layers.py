@@ -1,12 +1,13 @@
 """Speed and memory of the differentiable layers, forward and backward, against the field's usual code.
 
-    python benchmarks/layers.py [--parts solver] [--threads 2] [--repeats 5] [--out FILE]
+    python benchmarks/layers.py [--parts solver,blocks,basis,soft_map] [--threads 2] [--repeats 5] [--out FILE]
 
 solver: B = 8, K = 100, C = 256, float32. The twin takes the inverse of each row's matrix, as ULRSSM and its relatives
 do; it is written from their description (``tests/references/fmap_layers.py``). Both take turns, medians are reported:
 from the coefficients of the descriptors, and from features at 5000 vertices, where both spend the same time on the
 projection. Memory is the growth of a process's peak while it takes one step, each in a process of its own. The second
-part solves a block-diagonal map, 100 even and 100 odd functions, against one full map at K = 200.
+part solves a block-diagonal map, 100 even and 100 odd functions, against one full map at K = 200. basis: see
+layers_basis.py, soft_map: see layers_soft.py.
 Writes benchmarks/results/layers.json.
 """
 
@@ -24,6 +25,8 @@ from typing import Any
 
 import torch
 from common import RESULTS, ROOT, write_json
+from layers_basis import basis_part
+from layers_soft import soft_map_part
 from torch import Tensor
 
 from torchqm.fmap.regularized import regularized_blocks, regularized_fmap
@@ -160,7 +163,12 @@ def blocks_part(threads: int, repeats: int) -> dict[str, Any]:
     }
 
 
-PARTS: dict[str, Callable[[int, int], dict[str, Any]]] = {"solver": solver_part, "blocks": blocks_part}
+PARTS: dict[str, Callable[[int, int], dict[str, Any]]] = {
+    "solver": solver_part,
+    "blocks": blocks_part,
+    "basis": basis_part,
+    "soft_map": lambda threads, repeats: soft_map_part(threads=threads),
+}
 
 
 def main() -> None:

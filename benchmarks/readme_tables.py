@@ -218,6 +218,39 @@ def speed(data: dict[str, Any]) -> str:
     )
 
 
+def layers(data: dict[str, Any]) -> str:
+    """Time and memory of the layers."""
+    solver, blocks, basis, soft = (data[part] for part in ("solver", "blocks", "basis", "soft_map"))
+    case = solver["coefficients"]
+    pose = basis["in a pose"]
+    times = {name: pose[name]["checked"]["total_ms"] for name in ("float32", "float64")}
+    return (
+        f"Layers, `{data['command']}`, {data['machine']['torch_threads']} threads, forward and backward, medians of {data['repeats']}. "
+        f"Functional map, B = {solver['batch']}, K = {solver['k']}, C = {solver['descriptors']}, float32: "
+        f"{case['times_as_fast']['kept']:.1f} times as fast as an inverse for each row, in {case['share_of_memory']['kept']:.2f} of its "
+        f"memory ({case['median_ms']['kept']:.0f} ms against {case['median_ms']['twin']:.0f} ms from coefficients). Even and odd block of "
+        f"100 functions against one map of 200: {blocks['times_as_fast']:.1f} times as fast. Symmetrised basis of "
+        f"{pose['float32']['vertices']:,} vertices, K = {basis['k']}: {times['float32']:.0f} ms in float32, {times['float64']:.0f} ms in "
+        f"float64; {pose['float32']['bounds']['products_ms']:.0f} and {pose['float64']['bounds']['products_ms']:.0f} ms of it are "
+        f"the products with the basis. Soft map of 10,000 x 10,000 vertices, C = 256, 30 neighbours: {soft['worst_extra_gib']:.2f} GiB beside "
+        f"the features (dense: {soft['dense']['extra_gib']:.2f} GiB)."
+    )
+
+
+def comparison(folder: Path) -> str:
+    """The table of `torchqm benchmark` on TOSCA, and its figures."""
+    run = json.loads((folder / "run.json").read_text())["arguments"]
+    command = " ".join(["torchqm benchmark", run["root"], *(f"--{name} {run[name]}" for name in ("pairs", "methods"))])
+    table = (folder / "table.md").read_text().split("\n", 2)[2].strip()
+    return (
+        f"Comparison on published pairs of TOSCA, `{command}` (it wrote `benchmarks/results/comparison/`; a row for each protocol "
+        f"and method, with the number of pairs behind it):\n\n{table}\n\n"
+        "![Cumulative errors, the better of direct and mirrored truth for the whole map](docs/comparison_map.png)\n"
+        "![Cumulative errors, point by point up to symmetry](docs/comparison_orbit.png)\n"
+        "![Cumulative errors of self-symmetries](docs/comparison_symmetry.png)"
+    )
+
+
 def _row(cells: list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
@@ -240,6 +273,10 @@ def main() -> int:
             found[0]["creatures"] = {k: v for data in found for k, v in data["creatures"].items()}
         if found:
             parts.append(make(found[0]))
+    if (RESULTS / "layers.json").exists():
+        parts.append(layers(json.loads((RESULTS / "layers.json").read_text())))
+    if (RESULTS / "comparison").exists():
+        parts.insert(0, comparison(RESULTS / "comparison"))
     readme = ROOT / "README.md"
     text = readme.read_text()
     head, rest = text.split(BEGIN)
