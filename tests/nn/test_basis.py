@@ -1,16 +1,10 @@
 """torchqm.nn.basis: the layer is the classical split, learns a symmetry, compiles, exports and vmaps."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 from references.shapes import basis_of, blob
 from references.unchecked import unchecked
 
-import torchqm
 from torchqm.nn.basis import SymmetrizedBasis
 from torchqm.spectral import SoftMap
 from torchqm.symmetry import symmetrized_basis
@@ -118,57 +112,3 @@ def test_errors_come_from_the_function(mirror_blob):
         unchecked(layer.forward)(layer, evals, evecs, mass)
     with pytest.raises(ValueError, match=r"mass: shape \(1, 641\) given, expected \(1, V\) with V = 642 as in evecs"):
         unchecked(symmetrized_bases)(evals, evecs, mass[:, 1:], group=mirror_blob.group.maps[None])
-
-
-SCRIPT = """
-import torch
-from torchqm.nn.basis import SymmetrizedBasis
-
-torch.manual_seed(0)
-b, n, k = 2, 12, 6
-group = torch.stack([torch.arange(n), torch.arange(n).roll(6)]).repeat(b, 1, 1)
-evecs = torch.randn(b, n, k, dtype=torch.float64)
-evecs[:, 6:] = evecs[:, :6] * torch.tensor([1.0, 1, 1, 1, -1, -1])
-evecs = torch.linalg.qr(evecs).Q
-evals, mass = torch.tensor([0.0, 1, 1, 3, 3, 4]).double().repeat(b, 1), torch.ones(b, n).double()
-soft = (8 * torch.nn.functional.one_hot(group[:, 1], n)).double().softmax(-1)
-masks = {"verts_mask": torch.ones(b, n).bool(), "evals_mask": torch.arange(k).repeat(b, 1) < torch.tensor([[6], [5]])}
-layer = SymmetrizedBasis(k_even=4, k_odd=2)
-
-
-def loss(evals, evecs, mass, soft, **masks):
-    split = layer(evals, evecs, mass, soft_map=soft, **masks)
-    even = (split.evecs_trans_even * torch.arange(n)).square().sum()
-    return even + split.evals_odd.exp().sum() + split.evecs_odd.square().sum(-1).square().sum()
-
-
-inputs = [value.requires_grad_() for value in (evals, evecs, mass, soft)]
-
-
-def gradients(function):
-    return torch.autograd.grad(function(*inputs, **masks), inputs)
-
-
-def close(found, expected):
-    for a, b in zip(found, expected, strict=True):
-        torch.testing.assert_close(a, b, atol=1e-9, rtol=0)
-
-
-eager = gradients(loss)
-close(gradients(torch.compile(loss, fullgraph=True, backend="aot_eager")), eager)
-given = {"group": group, "group_mask": torch.ones(b, 2).bool(), **masks}
-want = layer(*inputs[:3], **given)
-exported = torch.export.export(layer, tuple(inputs[:3]), given).module()(*inputs[:3], **given)
-close(vars(exported).values(), vars(want).values())
-plain = [value.detach() for value in inputs]
-each = torch.func.vmap(torch.func.grad(lambda *x: loss(*x[:4], verts_mask=x[4], evals_mask=x[5]), argnums=(0, 1, 2, 3)))
-close(each(*plain, *masks.values()), eager)
-print("done")
-"""
-
-
-def test_compiled_exported_and_vmapped():
-    """In a process of its own: the suite's type checks break graphs."""
-    environment = os.environ | {"PYTHONPATH": str(Path(torchqm.__file__).parents[1])}
-    run = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, env=environment)
-    assert run.stdout.split() == ["done"], run.stderr[-3000:]
