@@ -62,6 +62,9 @@ class SoftMap:
         return torch.gather(self.indices, -1, self.weights.argmax(-1, keepdim=True))[..., 0]
 
 
+torch.export.register_dataclass(SoftMap)  # so that a layer that returns one can be exported (not vmapped: it holds a number)
+
+
 def soft_fmap(
     soft_yx: "SoftMap | Float[Tensor, '*B Y X']",
     evecs_x: Float[Tensor, "*B X Kx"],

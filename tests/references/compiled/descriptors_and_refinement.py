@@ -41,4 +41,8 @@ for layer, given in cases:
     dims = tuple(0 for _ in given)
     alone = torch.func.vmap(layer, dims)(*given)
     torch.testing.assert_close(alone.detach(), want[0])
-print("done")
+
+sparse = SoftPointMap(0.3, k=3)
+want = sparse(basis_x, basis_y)
+exported = torch.export.export(sparse, (basis_x, basis_y)).module()(basis_x, basis_y)
+torch.testing.assert_close(exported.to_dense(), want.to_dense())
