@@ -62,7 +62,7 @@ class SoftMap:
         return torch.gather(self.indices, -1, self.weights.argmax(-1, keepdim=True))[..., 0]
 
 
-torch.export.register_dataclass(SoftMap)  # so that a layer that returns one can be exported (not vmapped: it holds a number)
+torch.export.register_dataclass(SoftMap)  # a layer may return one; under vmap it may not: it holds a number
 
 
 def soft_fmap(
