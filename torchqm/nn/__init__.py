@@ -7,15 +7,20 @@ Shapes are those of a padded batch: features ``(B, V, C)``, ``evals (B, K)``, ``
 
 from torchqm.nn.basis import SymmetrizedBasis
 from torchqm.nn.descriptors import HeatKernelSignature, OrientationDescriptors, WaveKernelSignature
+from torchqm.nn.diffusion_net import DiffusionNet
+from torchqm.nn.features import MLP, InputFeatures
 from torchqm.nn.loss import FunctionalMapLoss, OrbitConsistencyLoss, PointToOrbitLoss
 from torchqm.nn.refine import QuotientICP, SpectralUpsampling
 from torchqm.nn.soft_map import Similarity, SoftPointMap
 from torchqm.nn.solver import FunctionalMapSolver
 
 __all__ = [
+    "MLP",
+    "DiffusionNet",
     "FunctionalMapLoss",
     "FunctionalMapSolver",
     "HeatKernelSignature",
+    "InputFeatures",
     "OrbitConsistencyLoss",
     "OrientationDescriptors",
     "PointToOrbitLoss",
