@@ -16,8 +16,8 @@ __all__ = ["StackedGradient", "gradient_features", "stacked_gradient"]
 class StackedGradient:
     """The gradients of a batch as one sparse matrix: with ``N = B V``, all rows along X and then all along Y.
 
-    One product with it takes less than half of the time of two of ``torch.bmm``. Differentiable (any number of times) in the
-    values, not in its own entries; ``torch.func.vmap``, ``torch.compile`` and ``torch.export`` do not take it.
+    One product with it takes less than half of the time of two ``torch.bmm``. Differentiable (any number of times) in
+    the values, not in its own entries; ``torch.func.vmap``, ``torch.compile`` and ``torch.export`` do not take it.
 
     Args:
         matrix: ``(2 N, N)`` sparse CSR.
