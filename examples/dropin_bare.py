@@ -19,13 +19,17 @@ network = torch.nn.Sequential(
 ).double()
 split, solver, loss = SymmetrizedBasis(), FunctionalMapSolver(lmbda=1.0), PointToOrbitLoss("spectral")
 optimizer = torch.optim.Adam(network.parameters(), 3e-3)
-halves = [split(s["evals"], s["evecs"], s["mass"], group=s["group"], evals_mask=s["evals_mask"]) for s in (x, y)]
+masks = ("group_mask", "evals_mask", "verts_mask")  # what is real in a padded batch
+halves = [
+    split(s["evals"], s["evecs"], s["mass"], group=s["group"], **{mask: s[mask] for mask in masks}) for s in (x, y)
+]
 truth = torch.arange(x["verts"].shape[1]).expand(2, -1)  # the two share their triangulation
 
 for step in range(10):
     feat = [network[1:](network[0](s["evals"], s["evecs"], s["mass"], s["evals_mask"])) for s in (x, y)]
     evals, evecs_trans = [h.evals_even for h in halves], [h.evecs_trans_even for h in halves]
-    fmap, _ = solver(*feat, *evals, *evecs_trans)
+    real = {f"evals_mask_{side}": h.evals_even_mask for side, h in zip("xy", halves, strict=True)}
+    fmap, _ = solver(*feat, *evals, *evecs_trans, **real)
     value = loss(truth, x["mass"], fmap_even=fmap, evecs_even_x=halves[0].evecs_even, evecs_even_y=halves[1].evecs_even)
     optimizer.zero_grad()
     value.backward()

@@ -26,7 +26,8 @@ class Extractor(torch.nn.Module):
 
 def even(data):
     """The same item with the basis of its symmetric functions in place of the full one."""
-    split = SymmetrizedBasis()(data["evals"], data["evecs"], data["mass"], group=data["group"])
+    masks = {name: data[name] for name in ("group_mask", "evals_mask", "verts_mask")}  # of a padded batch
+    split = SymmetrizedBasis()(data["evals"], data["evecs"], data["mass"], group=data["group"], **masks)
     return data | {"evals": split.evals_even, "evecs": split.evecs_even, "evecs_trans": split.evecs_trans_even}
 
 
@@ -36,11 +37,10 @@ def train(quotient_aware, batch, k, steps=15):
     extractor = Extractor(k).double()
     permutation, criterion = Similarity(tau=0.07), FunctionalMapLoss(w_bij=1.0, w_orth=1.0, w_lap=1e-3)
     optimizer = torch.optim.Adam(extractor.parameters(), 1e-3)
-    feats_of = extractor  # it always sees the full basis: its descriptors are even already
     fmap_net = FunctionalMapSolver(lmbda=100, resolvant_gamma=0.5, bidirectional=True)  # was: RegularizedFMNet(...)
     change_basis = even if quotient_aware else dict  # was: nothing
     for _ in range(steps):
-        feat_x, feat_y = (torch.nn.functional.normalize(feats_of(batch[side]), dim=-1) for side in ("first", "second"))
+        feat_x, feat_y = (torch.nn.functional.normalize(extractor(batch[side]), dim=-1) for side in ("first", "second"))
         data_x, data_y = change_basis(batch["first"]), change_basis(batch["second"])
         c_xy, c_yx = fmap_net(
             *(feat_x, feat_y, data_x["evals"], data_y["evals"], data_x["evecs_trans"], data_y["evecs_trans"])

@@ -25,6 +25,15 @@ def test_letters_are_learned_and_compared():
         sizes.bind("faces", [1, 2], "F 3")
 
 
+def test_one_dtype_for_all_real_numbers():
+    sizes = checks.Sizes()
+    sizes.bind("feat", torch.zeros(5, 2), "V C")
+    sizes.bind("ids", torch.zeros(5, dtype=torch.int64), "V")
+    sizes.bind("weights", torch.zeros(2, dtype=torch.float64), "C", any_dtype=True)
+    with pytest.raises(ValueError, match=r"mass: dtype torch\.float64 given, expected torch\.float32 as in feat"):
+        sizes.bind("mass", torch.zeros(5, dtype=torch.float64), "V")
+
+
 def test_a_wrong_argument_teaches_nothing():
     sizes = checks.Sizes()
     with pytest.raises(ValueError, match="verts"):

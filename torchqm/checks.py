@@ -73,6 +73,7 @@ class Sizes:
     def __init__(self) -> None:
         self._known: dict[str, tuple[int, str]] = {}
         self._leading: tuple[tuple[int, ...], str] | None = None
+        self._dtype: tuple[torch.dtype, str] | None = None
 
     def __getitem__(self, letter: str) -> int:
         return self._known[letter][0]
@@ -82,19 +83,28 @@ class Sizes:
         """The sizes that ``...`` stands for."""
         return self._leading[0] if self._leading else ()
 
-    def bind(self, name: str, tensor: object, dims: str) -> None:
+    def bind(self, name: str, tensor: object, dims: str, any_dtype: bool = False) -> None:
         """Check one argument against the letters that are known, and learn the others from it.
+
+        Arguments of real numbers must have one dtype, except under autocast.
 
         Args:
             name: of the argument, for the message.
             tensor: its value.
             dims: letters or numbers with spaces between them; ``...`` in front stands for any number of batch sizes.
+            any_dtype: this one may have a dtype of its own.
 
         Raises:
-            ValueError: the tensor has other sizes; ``TypeError`` if it is no tensor.
+            ValueError: the tensor has other sizes or another dtype; ``TypeError`` if it is no tensor.
         """
         if not isinstance(tensor, Tensor):
             raise TypeError(f"{name}: expected a tensor, got {type(tensor).__name__}")
+        free = any_dtype or "mask" in name or torch.is_autocast_enabled(tensor.device.type)  # masks: require_mask
+        if tensor.is_floating_point() and not free:
+            dtype, source = self._dtype or (tensor.dtype, name)
+            if tensor.dtype != dtype:
+                raise ValueError(f"{name}: dtype {tensor.dtype} given, expected {dtype} as in {source}")
+            self._dtype = (dtype, source)
         words = dims.split()
         open_front = words[0] == "..."
         letters = words[1:] if open_front else words

@@ -54,6 +54,17 @@ def test_the_constant_function_has_no_infinite_slope():
     assert commutativity_mask(zero, zero, "normalized").abs().max() == 0  # not 0 / 0
 
 
+@pytest.mark.parametrize("rounding", [0.0, 1e-27, 1e-16, -1e-17])
+def test_rounding_of_zero_has_a_value_and_no_slope(rounding):
+    """The Rayleigh quotient of the constant function comes out as 1e-30 or so: the slope there would be 1e15."""
+    x = X.clone().index_fill_(0, torch.tensor(0), rounding).requires_grad_()
+    mask = commutativity_mask(x, Y)
+    torch.testing.assert_close(mask.detach(), commutativity_mask(X, Y), atol=1e-7, rtol=0)
+    (grad,) = torch.autograd.grad(mask.sum(), x)
+    assert float(grad[0]) == 0.0
+    assert float(grad.abs().max()) < 10
+
+
 def test_refusals():
     with pytest.raises(ValueError, match="commutativity is 'cubic'; allowed are squared, normalized, resolvent"):
         commutativity_mask(X, Y, "cubic")

@@ -8,7 +8,7 @@ from torchqm.matching import match_quotient
 from torchqm.matching.initial import shared_descriptors
 from torchqm.nn import FunctionalMapSolver, QuotientICP, SymmetrizedBasis
 from torchqm.symmetry import symmetrized_basis
-from torchqm.testing import assert_orbit_equal
+from torchqm.testing import assert_orbit_equal, gradcheck64
 
 PARAMETERS = FAST.changed(local_weight=0.0)
 
@@ -43,6 +43,28 @@ def layered(exact, matched):
     samples, anchors = exact.x.samples[: PARAMETERS.n_samples], exact.y.anchors
     refined = icp(first, halves[0].evecs_even[:, samples], halves[1].evecs_even[:, anchors])
     return halves, first, refined
+
+
+def test_gradients_of_the_whole_chain():
+    """From a soft self-map through the split and the default solver to a loss: nothing large times rounding."""
+    generator = torch.Generator().manual_seed(0)
+    n, k = 10, 6
+    angle = 2 * torch.pi * torch.arange(n, dtype=torch.float64) / n
+    columns = [torch.ones(n).double(), *(f(m * angle) for m in (1, 2, 3) for f in (torch.cos, torch.sin))]
+    evecs = torch.linalg.qr(torch.stack(columns, 1)).Q[:, :k]
+    evals = torch.tensor([0.0, 1.0, 1.05, 4.0, 4.1, 9.0], dtype=torch.float64)
+    mass = torch.ones(n, dtype=torch.float64)
+    feat_x, feat_y = (torch.randn(n, 8, generator=generator, dtype=torch.float64) for _ in range(2))
+    mirror = torch.nn.functional.one_hot((-torch.arange(n)) % n, n).double()
+    logits = 6 * mirror + 0.1 * torch.randn(n, n, generator=generator, dtype=torch.float64)
+    split, solver = SymmetrizedBasis(), FunctionalMapSolver(lmbda=1.0)
+
+    def loss(logits, higher, feat_x):
+        half = split(torch.cat([evals[:1], higher]), evecs, mass, soft_map=logits.softmax(-1))
+        fmap, _ = solver(feat_x, feat_y, *[half.evals_even] * 2, *[half.evecs_trans_even] * 2)
+        return (half.evecs_even @ fmap @ half.evecs_trans_even).square().sum()
+
+    gradcheck64(loss, logits, evals[1:], feat_x)  # at 0 the root in the resolvent has no slope
 
 
 def in_full_bases(halves, fmap):

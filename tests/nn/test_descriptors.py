@@ -159,6 +159,20 @@ def test_orientation_in_a_batch_with_padding(shape, basis):
     assert not batch[:, -7:].any()
 
 
+def test_orientation_names_faces_out_of_range(shape, basis):
+    layer = OrientationDescriptors(3)
+    with pytest.raises(ValueError, match=r"faces: ids from 2 to 643 given, allowed are 0\.\.641"):
+        layer(basis.evecs[:, 1:4], shape.mesh.faces + 2, basis.mass)
+
+
+def test_heat_that_is_gone_everywhere_leaves_the_constant():
+    """All exponentials underflow in float32."""
+    layer = HeatKernelSignature(times=torch.tensor([10.0]))
+    evals, evecs = torch.tensor([700.0, 800.0, 900.0]), torch.arange(6.0).view(2, 3)
+    found = layer(evals, evecs, torch.full((2,), 0.5))
+    torch.testing.assert_close(found, evecs[:, :1].square())
+
+
 def test_orientation_gradients():
     mesh = icosphere(0)
     layer = OrientationDescriptors(3)

@@ -1,8 +1,11 @@
 """torchqm.nn.solver: what ULRSSM's layer returns, in both precisions, and what that one cannot do."""
 
+from functools import partial
+
 import pytest
 import torch
 from references.fmap_layers import regularized_fmap_net
+from references.unchecked import unchecked
 
 from torchqm.fmap.regularized import regularized_fmap
 from torchqm.nn.solver import FunctionalMapSolver
@@ -159,3 +162,42 @@ def test_inputs_that_do_not_fit():
         layer(torch.where(torch.arange(6) < 2, torch.nan, feat_x), feat_y, x, y, trans_x, trans_y)
     with pytest.raises(ValueError, match=r"row\(s\) \[0, 1, 2, 3\] of sample 0"):
         FunctionalMapSolver(0.0)(feat_x[..., :2], feat_y[..., :2], x, y, trans_x, trans_y)
+
+
+def test_an_odd_block_of_rounding_is_no_map():
+    """Features that are even leave 1e-16 in the odd basis: without a ridge an error, with it zero."""
+    generator = torch.Generator().manual_seed(0)
+    basis = torch.linalg.qr(torch.randn(30, 9, generator=generator, dtype=torch.float64)).Q.T
+    even, odd = basis[:5], basis[5:]
+    feat = even.T @ torch.randn(5, 12, generator=generator, dtype=torch.float64)
+    evals = torch.arange(5.0).double()
+    given = {"evals_odd_x": evals[1:], "evals_odd_y": evals[1:], "evecs_trans_odd_x": odd, "evecs_trans_odd_y": odd}
+    with pytest.raises(ValueError, match="undetermined"):
+        FunctionalMapSolver()(feat, feat, evals, evals, even, even, **given)
+    (found, nothing), _ = FunctionalMapSolver(ridge=1e-6)(feat, feat, evals, evals, even, even, **given)
+    torch.testing.assert_close(found, torch.eye(5, dtype=torch.float64), atol=1e-5, rtol=0)
+    assert float(nothing.abs().max()) < 1e-9
+
+
+def test_every_argument_has_its_own_name():
+    feat, evals, trans = torch.ones(2, 6, 3), torch.arange(4.0).expand(2, 4), torch.ones(2, 4, 6)
+    usual = (feat, feat, evals, evals, trans, trans)
+    odd = {"evals_odd_x": evals, "evals_odd_y": evals, "evecs_trans_odd_x": trans, "evecs_trans_odd_y": trans}
+    layer = partial(unchecked(FunctionalMapSolver.forward), FunctionalMapSolver())
+    for wrong, message in (
+        ({"extra_x": feat * torch.nan, "extra_y": feat}, "extra_x: 36 of 36 entries are NaN"),
+        ({"extra_x": feat[:, 1:], "extra_y": feat}, r"extra_x: shape \(2, 5, 3\) given, .* Vx = 6 as in feat_x"),
+        ({"extra_x": feat, "extra_y": feat[..., 1:]}, r"extra_y: shape \(2, 6, 2\) given, .* E = 3 as in extra_x"),
+        ({"evals_mask_x": torch.ones(2, 3, dtype=torch.bool)}, r"evals_mask_x: shape \(2, 3\) given"),
+        (odd | {"evals_odd_x": evals * torch.nan}, "evals_odd_x: 8 of 8 entries are NaN"),
+        (odd | {"evecs_trans_odd_y": trans[:, :, 1:]}, r"evecs_trans_odd_y: shape \(2, 4, 5\)"),
+        (odd | {"evals_mask_x": torch.zeros(2, 4, dtype=torch.bool)}, "evals_mask_x: no true element"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            layer(*usual, **wrong)
+    with pytest.raises(ValueError, match=r"feat_y: dtype torch\.float64 given, expected torch\.float32 as in feat_x"):
+        layer(feat, feat.double(), *usual[2:])
+    with pytest.raises(ValueError, match="extra_weight is -1"):
+        FunctionalMapSolver(extra_weight=-1)
+    with pytest.raises(ValueError, match="commutativity is 'cubed'"):
+        FunctionalMapSolver(commutativity="cubed")

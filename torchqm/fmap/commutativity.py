@@ -39,8 +39,8 @@ def commutativity_mask(
         evals_x: ``(..., Kx)`` eigenvalues of the source.
         evals_y: ``(..., Ky)`` eigenvalues of the target.
         kind: one of the three names.
-        gamma: of the resolvent. Its eigenvalues at or below zero (rounding of the constant function's) count as zero,
-            and get gradient zero: for ``gamma < 1`` the power has an infinite slope there.
+        gamma: of the resolvent. Its eigenvalues below zero count as zero, and those that rounding leaves of the
+            constant function's zero get gradient zero: for ``gamma < 1`` the power has an infinite slope there.
         scale: ``(...)`` the eigenvalue that counts as 1; None: :func:`spectral_scale` of the pair.
 
     Raises:
@@ -64,8 +64,14 @@ def commutativity_mask(
         evals_x, evals_y = evals_x / scale[..., None], evals_y / scale[..., None]
     if kind != "resolvent":
         return (evals_y[..., :, None] - evals_x[..., None, :]).square()
-    # The inner where keeps the infinite slope at zero out of the gradient, the outer one its value.
-    q, p = (torch.where(e > 0, torch.where(e > 0, e, 1.0).pow(gamma), 0.0) for e in (evals_x, evals_y))
+    q, p = (_power(e, gamma) for e in (evals_x, evals_y))
     return (p[..., :, None] - q[..., None, :]).square() / (
         (1 + p.square())[..., :, None] * (1 + q.square())[..., None, :]
     )
+
+
+def _power(evals: Tensor, gamma: float) -> Tensor:
+    """``evals^gamma``, constant in the gradient where an eigenvalue is rounding of zero (the largest is about 1)."""
+    real = evals > evals.shape[-1] * torch.finfo(evals.dtype).eps
+    # The inner where keeps the slope at zero out of the gradient.
+    return torch.where(real, torch.where(real, evals, 1.0).pow(gamma), evals.detach().clamp_min(0).pow(gamma))

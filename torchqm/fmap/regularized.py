@@ -22,14 +22,16 @@ __all__ = [
 
 
 def descriptor_coefficients(
-    feat: Float[Tensor, "*B V C"], evecs_trans: Float[Tensor, "*B K V"], side: str = "x"
+    feat: Float[Tensor, "*B V C"],
+    evecs_trans: Float[Tensor, "*B K V"],
+    names: tuple[str, str] = ("feat", "evecs_trans"),
 ) -> Float[Tensor, "*B K C"]:
     """``Phi^T A f``: features at vertices, written in a basis.
 
     Args:
         feat: ``(..., V, C)`` values at vertices; where ``evecs_trans`` is zero (padding), any finite ones.
         evecs_trans: ``(..., K, V)`` transposed basis times vertex areas.
-        side: the shape's letter, for messages.
+        names: what the two are called in messages.
 
     Raises:
         ValueError: shapes that do not fit, or values that are not finite.
@@ -39,12 +41,12 @@ def descriptor_coefficients(
         [[2.0]]
     """
     sizes = Sizes()
-    sizes.bind(f"feat_{side}", feat, "... V C")
-    sizes.bind(f"evecs_trans_{side}", evecs_trans, "... K V")
+    sizes.bind(names[0], feat, "... V C")
+    sizes.bind(names[1], evecs_trans, "... K V")
     coeffs = evecs_trans @ feat
     if enabled() and not bool(torch.isfinite(coeffs).all()):  # small beside the features, which are looked at now only
-        require_finite(f"feat_{side}", feat)
-        require_finite(f"evecs_trans_{side}", evecs_trans)
+        require_finite(names[0], feat)
+        require_finite(names[1], evecs_trans)
     return coeffs
 
 
@@ -145,8 +147,9 @@ def regularized_blocks(
         gamma: of the resolvent.
         weights: ``(C,)`` or ``(..., C)``.
         sample_weights: ``(...)``.
-        ridge: multiple of the mean descriptor energy of each block.
-        evals_mask_x: for each block ``(..., Kx)``; all blocks but one may be padding alone.
+        ridge: multiple of the mean descriptor energy of all blocks. A block whose descriptors are rounding beside those
+            of the others counts as one without descriptors.
+        evals_mask_x: for each block ``(..., Kx)``; all blocks but the first may be padding alone.
         evals_mask_y: for each block ``(..., Ky)``.
         scale: ``(...)``; None: the largest eigenvalue of all blocks of the pair.
         row_chunk: see :func:`torchqm.fmap.rows.solve_rows`.
@@ -166,18 +169,41 @@ def regularized_blocks(
         if len(parts) != len(coeffs_x):
             raise ValueError(f"{name}: {len(parts)} blocks given, coeffs_x has {len(coeffs_x)}")
     spectra = []
-    for name, evals, masks in (("evals_mask_x", evals_x, masks_x), ("evals_mask_y", evals_y, masks_y)):
-        full = [torch.ones_like(e, dtype=torch.bool) if m is None else m for e, m in zip(evals, masks, strict=True)]
-        require_mask(name, torch.cat(full, -1))  # of all blocks: a shape without symmetry has no odd functions
-        spectra += [e * m for e, m in zip(evals, full, strict=True)]
+    for side, evals, masks in (("x", evals_x, masks_x), ("y", evals_y, masks_y)):
+        for number, (e, m) in enumerate(zip(evals, masks, strict=True)):
+            if m is not None:
+                sizes = Sizes()
+                sizes.bind(f"evals_{side}[{number}]", e, "... K")
+                sizes.bind(f"evals_mask_{side}[{number}]", m, "... K")
+                if number == 0:  # the constant function is even; a shape without symmetry has no odd functions
+                    require_mask(f"evals_mask_{side}[0]", m)
+                e = e * m
+            spectra.append(e)
     scale = spectral_scale(*spectra) if scale is None else scale
-    return tuple(
-        _minimum(
-            *(a, b, u, v, lmbda, commutativity, gamma),
-            *(weights, sample_weights, ridge, mask_x, mask_y, scale, row_chunk),
-        )
-        for a, b, u, v, mask_x, mask_y in zip(coeffs_x, coeffs_y, evals_x, evals_y, masks_x, masks_y, strict=True)
-    )
+    energy = _mean_energy([_weighted(a, weights, sample_weights, _sizes_of(a)) * a for a in coeffs_x], masks_x)
+    found = []
+    for a, b, u, v, mask_x, mask_y in zip(coeffs_x, coeffs_y, evals_x, evals_y, masks_x, masks_y, strict=True):
+        options = (weights, sample_weights, ridge, mask_x, mask_y, scale, row_chunk, energy)
+        found.append(_minimum(a, b, u, v, lmbda, commutativity, gamma, *options))
+    return tuple(found)
+
+
+def _sizes_of(coeffs: Tensor) -> Sizes:
+    sizes = Sizes()
+    sizes.bind("coeffs_x", coeffs, "... Kx C")
+    return sizes
+
+
+def _mean_energy(products: Sequence[Tensor], masks: Sequence[Tensor | None]) -> Tensor:
+    """``(..., 1, 1)`` mean over the real functions of all blocks of the sum over their descriptors; 1 instead of 0."""
+    total: Tensor | float = 0.0
+    count: Tensor | float = 0.0
+    for product, mask in zip(products, masks, strict=True):
+        energies = product.sum(-1)
+        total = total + (energies if mask is None else energies * mask).sum(-1)
+        count = count + (energies.shape[-1] if mask is None else mask.sum(-1))
+    mean = torch.as_tensor(total / torch.as_tensor(count).clamp_min(1))
+    return torch.where(mean > 0, mean, 1.0)[..., None, None]
 
 
 def _minimum(
@@ -195,6 +221,7 @@ def _minimum(
     evals_mask_y: Tensor | None,
     scale: Tensor | None,
     row_chunk: int | None,
+    energy: Tensor | None = None,
 ) -> Tensor:
     sizes = Sizes()
     sizes.bind("coeffs_x", coeffs_x, "... Kx C")
@@ -213,10 +240,13 @@ def _minimum(
         coeffs_y, evals_y = coeffs_y * evals_mask_y[..., None], evals_y * evals_mask_y
 
     weighted = _weighted(coeffs_x, weights, sample_weights, sizes)
+    own = _mean_energy([weighted * coeffs_x], [evals_mask_x])
+    if energy is None:
+        energy = own
+    else:  # of a block that holds only what rounding leaves, nothing is known
+        noise = own <= (sizes["C"] * torch.finfo(own.dtype).eps) ** 2 * energy
+        weighted, coeffs_y = torch.where(noise, 0.0, weighted), torch.where(noise, 0.0, coeffs_y)
     gram = weighted @ coeffs_x.mT
-    total = gram.diagonal(dim1=-2, dim2=-1).sum(-1)
-    real = max(sizes["Kx"], 1) if evals_mask_x is None else evals_mask_x.sum(-1).clamp_min(1)
-    energy = torch.where(total > 0, total / real, 1.0)[..., None, None]
     diagonal = _one_a_sample(lmbda, sizes) * commutativity_mask(evals_x, evals_y, commutativity, gamma, scale)
     if ridge:
         diagonal = diagonal + ridge * energy
@@ -231,11 +261,11 @@ def _minimum(
 def _weighted(coeffs: Tensor, weights: Tensor | None, sample_weights: Tensor | None, sizes: Sizes) -> Tensor:
     """``s A W``."""
     if weights is not None:
-        sizes.bind("weights", weights, "C" if weights.ndim == 1 else "... C")
+        sizes.bind("weights", weights, "C" if weights.ndim == 1 else "... C", any_dtype=True)
         require_nonnegative("weights", weights)
         coeffs = coeffs * weights[..., None, :].to(coeffs.dtype)
     if sample_weights is not None:
-        sizes.bind("sample_weights", sample_weights[..., None], "... 1")
+        sizes.bind("sample_weights", sample_weights[..., None], "... 1", any_dtype=True)
         require_nonnegative("sample_weights", sample_weights)
         coeffs = coeffs * sample_weights[..., None, None].to(coeffs.dtype)
     return coeffs
@@ -248,6 +278,6 @@ def _one_a_sample(lmbda: float | Tensor, sizes: Sizes) -> float | Tensor:
             raise ValueError(f"lmbda is {lmbda}; only finite numbers from zero are allowed")
         return lmbda
     if lmbda.ndim:
-        sizes.bind("lmbda", lmbda[..., None], "... 1")
+        sizes.bind("lmbda", lmbda[..., None], "... 1", any_dtype=True)
     require_nonnegative("lmbda", lmbda)
     return lmbda[..., None, None] if lmbda.ndim else lmbda

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchqm.checks import Sizes, require_finite
+from torchqm.checks import Sizes, require_finite, require_mask, require_nonnegative
 from torchqm.fmap.polar import nearest_isometry
 from torchqm.fmap.soft import soft_map
 from torchqm.spectral.soft_map import SoftMap
@@ -45,7 +45,8 @@ def soft_icp(
         steps: number of iterations; 0 returns the input.
         tau: temperature, in mean squares of a basis function on a shape of area one. Zero is not allowed.
         neighbours: how many partners share the weight of one point; all of them by default, in ``X x Y`` memory.
-        weights_x: ``(..., X)`` areas that the samples stand for; all the same by default. Padded samples get 0.
+        weights_x: ``(..., X)`` areas that the samples stand for, not negative; all the same by default. Padded samples
+            get 0.
         verts_mask_y: ``(..., Y)`` true where a vertex of y is real.
         evals_mask_x: ``(..., Kx)`` true where a function of x is real; padded functions are zero, and stay so.
         evals_mask_y: ``(..., Ky)`` likewise on y.
@@ -64,19 +65,24 @@ def soft_icp(
     References:
         Paper, section 4.3, Quotient-ICP, and section 5.
     """
-    sizes = _checked(fmap_xy, evecs_x, evecs_y, steps, tau, weights_x, verts_mask_y)
+    sizes = _checked(fmap_xy, evecs_x, evecs_y, steps, tau, neighbours, weights_x, verts_mask_y)
     mask = None
+    count: int | Tensor = sizes["Ky"]
     if evals_mask_x is not None or evals_mask_y is not None:
         ones = fmap_xy.new_ones(1, dtype=torch.bool)
         if evals_mask_x is not None:
             sizes.bind("evals_mask_x", evals_mask_x, "... Kx")
+            require_mask("evals_mask_x", evals_mask_x)
         if evals_mask_y is not None:
             sizes.bind("evals_mask_y", evals_mask_y, "... Ky")
+            require_mask("evals_mask_y", evals_mask_y)
+            count = evals_mask_y.sum(-1).to(fmap_xy.dtype)[..., None, None]
         mask = (ones if evals_mask_y is None else evals_mask_y)[..., :, None] & (
             ones if evals_mask_x is None else evals_mask_x
         )[..., None, :]
     for _ in range(steps):
-        fmap_xy = _step(fmap_xy, evecs_x, evecs_y, *_sizes_of(fmap_xy), tau, neighbours, weights_x, verts_mask_y)
+        sizes_yx = _sizes_of(fmap_xy)
+        fmap_xy = _step(fmap_xy, evecs_x, evecs_y, *sizes_yx, tau, neighbours, weights_x, verts_mask_y, count)
         if mask is not None:
             fmap_xy = torch.where(mask, fmap_xy, 0.0)
     return fmap_xy
@@ -129,7 +135,7 @@ def soft_upsample(
             f"fmap_xy: shape ({ky}, {kx}) given, but the bases have {evecs_y.shape[-1]} and "
             f"{evecs_x.shape[-1]} functions"
         )
-    _checked(fmap_xy, evecs_x[..., :kx], evecs_y[..., :ky], steps, tau, weights_x, verts_mask_y)
+    _checked(fmap_xy, evecs_x[..., :kx], evecs_y[..., :ky], steps, tau, neighbours, weights_x, verts_mask_y)
     for size in sizes:
         for _ in range(steps):
             fmap_xy = _step(fmap_xy, evecs_x, evecs_y, size, size, tau, neighbours, weights_x, verts_mask_y)
@@ -150,9 +156,10 @@ def _step(
     neighbours: int | None,
     weights_x: Tensor | None,
     verts_mask_y: Tensor | None,
+    count: int | Tensor | None = None,
 ) -> Tensor:
     ky, kx = _sizes_of(fmap_xy)
-    scale = ky**-0.5  # so that a squared distance is the mean over the functions
+    scale = (ky if count is None else count) ** -0.5  # so that a squared distance is the mean over the functions
     images = evecs_x[..., :kx] @ fmap_xy.mT
     soft = soft_map(scale * images, scale * evecs_y[..., :ky], tau, neighbours, mask_y=verts_mask_y, kind="distance")
     target = evecs_y[..., :size_y]
@@ -167,6 +174,7 @@ def _checked(
     evecs_y: Tensor,
     steps: int,
     tau: float | Tensor,
+    neighbours: int | None,
     weights_x: Tensor | None,
     verts_mask_y: Tensor | None,
 ) -> Sizes:
@@ -180,8 +188,13 @@ def _checked(
     sizes.bind("evecs_y", evecs_y, "... Y Ky")
     if weights_x is not None:
         sizes.bind("weights_x", weights_x, "... X")
+        require_nonnegative("weights_x", weights_x)
+        require_mask("weights_x > 0", weights_x > 0)
     if verts_mask_y is not None:
         sizes.bind("verts_mask_y", verts_mask_y, "... Y")
+        require_mask("verts_mask_y", verts_mask_y)
+    if neighbours is not None and not 1 <= neighbours <= sizes["Y"]:
+        raise ValueError(f"neighbours={neighbours}: of {sizes['Y']} vertices 1..{sizes['Y']} can be partners")
     for name, tensor in (("fmap_xy", fmap_xy), ("evecs_x", evecs_x), ("evecs_y", evecs_y)):
         require_finite(name, tensor)
     return sizes

@@ -91,7 +91,8 @@ def match_prepared(
             elif method == "quotient" and oriented:
                 full = full_map_from_blocks(found, x, y, known_x, known_y, parameters)
                 fmap, odd, even = full.fmap, full.odd, full.quotient.fmap
-                details |= {"residual_direct": odd.residual_direct, "residual_mirrored": odd.residual_mirrored}
+                if not full.synchronized:
+                    details |= {"residual_direct": odd.residual_direct, "residual_mirrored": odd.residual_mirrored}
                 details |= {"candidate_scores": list(full.scores)}
                 details |= {"synchronized": full.synchronized}
                 separated = None if full.synchronized else odd.separated

@@ -45,7 +45,7 @@ class SynchronizedHalves:
 
     def agreement(self, images: Int[Tensor, " S"]) -> float:
         """Weighted share of samples with the same choice as in another map, up to exchanging all; 0.5 to 1."""
-        same = float((self.weights * (images == self.images)).sum() / self.weights.sum().clamp_min(1e-300))
+        same = _share((self.weights * (images == self.images)).sum(), self.weights.sum())
         return max(same, 1 - same)
 
 
@@ -115,9 +115,13 @@ def synchronize_signs(
         weight = torch.zeros_like(products).scatter_(1, found.indices, torch.exp(-((found.values / scale) ** 2)))
         couplings += sign * torch.maximum(weight, weight.T) * products
     couplings.fill_diagonal_(0.0)
-    signs = torch.tensor(_joined(couplings), dtype=points.dtype)
-    satisfied = (signs[:, None] * couplings * signs).sum() / couplings.abs().sum().clamp_min(1e-300)
-    return signs, float((1 + satisfied) / 2)
+    signs = torch.tensor(_joined(couplings), dtype=points.dtype, device=points.device)
+    satisfied = _share((signs[:, None] * couplings * signs).sum(), couplings.abs().sum())
+    return signs, (1 + satisfied) / 2
+
+
+def _share(part: Tensor, whole: Tensor) -> float:
+    return float(part / whole.clamp_min(torch.finfo(whole.dtype).tiny))
 
 
 def _joined(couplings: Float[Tensor, "S S"]) -> list[float]:

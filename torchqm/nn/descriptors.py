@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchqm.checks import Sizes, require_finite, require_mask, require_nonnegative
+from torchqm.fmap.tables import require_ids
 from torchqm.spectral.descriptors import WaveEnergies, heat_kernel_values, wave_kernel_values
 from torchqm.symmetry.orientation import function_pairs, orientation_descriptors
 
@@ -158,7 +159,7 @@ class OrientationDescriptors(nn.Module):
         """Odd descriptors ``(B, V, P)`` of features ``(B, V, C)`` on triangles ``(B, F, 3)``.
 
         Raises:
-            ValueError: sizes that do not fit, negative mass, non-finite features.
+            ValueError: sizes that do not fit, negative mass, non-finite features, ids out of range.
         """
         sizes = Sizes()
         sizes.bind("feat", feat, f"... V {self.n_features}")
@@ -166,6 +167,7 @@ class OrientationDescriptors(nn.Module):
         sizes.bind("mass", mass, "... V")
         require_finite("feat", feat)
         require_nonnegative("mass", mass)
+        require_ids("faces", faces, sizes["V"])
         return orientation_descriptors(feat, faces, mass, self.pairs)
 
     def extra_repr(self) -> str:

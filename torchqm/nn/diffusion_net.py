@@ -157,10 +157,10 @@ class DiffusionNet(nn.Module):
 
     def _check(self, x_in: Tensor, mass: Tensor, evals: Tensor, evecs: Tensor, verts_mask: Tensor | None) -> None:
         sizes = Sizes()
-        sizes.bind("x_in", x_in, f"... V {self.c_in}")
-        sizes.bind("mass", mass, "... V")
-        sizes.bind("evecs", evecs, "... V K")
-        sizes.bind("evals", evals, "... K")
+        sizes.bind("x_in", x_in, f"... V {self.c_in}", any_dtype=True)  # dtypes: see below
+        sizes.bind("mass", mass, "... V", any_dtype=True)
+        sizes.bind("evecs", evecs, "... V K", any_dtype=True)
+        sizes.bind("evals", evals, "... K", any_dtype=True)
         if not torch.is_autocast_enabled(x_in.device.type):
             self._check_dtype("x_in", x_in)
         for name, tensor in (("mass", mass), ("evals", evals), ("evecs", evecs)):

@@ -15,8 +15,6 @@ __all__ = ["QuotientICP", "SpectralUpsampling"]
 class _Refinement(nn.Module):
     """What the two have in common: a temperature, which may be learned, and how many partners a point has."""
 
-    log_tau: Tensor
-
     def __init__(self, steps: int, tau: float, learn_tau: bool, neighbours: int | None) -> None:
         super().__init__()
         if tau <= 0:
@@ -24,18 +22,18 @@ class _Refinement(nn.Module):
         if neighbours is not None and neighbours < 1:
             raise ValueError(f"neighbours={neighbours}: a point has at least one partner; None is all of them")
         self.steps, self.neighbours = steps, neighbours
-        start = torch.tensor(log(tau))
-        if learn_tau:
-            self.log_tau = nn.Parameter(start)
-        else:
-            self.register_buffer("log_tau", start)
+        self._fixed = tau
+        self.log_tau = nn.Parameter(torch.tensor(log(tau))) if learn_tau else None
 
-    def _tau(self, like: Tensor) -> Tensor:
-        return self.log_tau.exp().to(like.dtype)
+    def _tau(self, like: Tensor) -> float | Tensor:
+        return self._fixed if self.log_tau is None else self.log_tau.exp().to(like.dtype)
+
+    def _shown(self) -> float:
+        return self._fixed if self.log_tau is None else float(self.log_tau.detach().exp())
 
     def extra_repr(self) -> str:
         """What ``print`` shows."""
-        return f"steps={self.steps}, tau={float(self.log_tau.detach().exp()):.3g}, neighbours={self.neighbours}"
+        return f"steps={self.steps}, tau={self._shown():.3g}, neighbours={self.neighbours}"
 
 
 class QuotientICP(_Refinement):

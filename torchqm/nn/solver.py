@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from torchqm.checks import Sizes, require_finite, require_mask
+from torchqm.fmap.commutativity import COMMUTATIVITY
 from torchqm.fmap.regularized import descriptor_coefficients, regularized_blocks
 
 __all__ = ["FunctionalMapSolver"]
@@ -60,6 +62,10 @@ class FunctionalMapSolver(nn.Module):
         super().__init__()
         if learn_lmbda and not lmbda > 0:
             raise ValueError(f"lmbda is {lmbda}; to be learned it must be above zero")
+        if commutativity not in COMMUTATIVITY:
+            raise ValueError(f"commutativity is {commutativity!r}; allowed are {', '.join(COMMUTATIVITY)}")
+        if not 0 <= extra_weight < float("inf"):
+            raise ValueError(f"extra_weight is {extra_weight}; only finite numbers from zero are allowed")
         self.resolvant_gamma, self.bidirectional, self.commutativity = resolvant_gamma, bidirectional, commutativity
         self.extra_weight, self.ridge, self.row_chunk = extra_weight, ridge, row_chunk
         self._lmbda = lmbda
@@ -120,11 +126,39 @@ class FunctionalMapSolver(nn.Module):
             None. With odd bases each of the two is a pair: even to even, odd to odd.
 
         Raises:
-            ValueError: see :func:`torchqm.fmap.regularized.regularized_fmap`; also where one of several arguments that
+            ValueError: see :func:`torchqm.fmap.regularized.regularized_fmap` (float32 systems that rounding makes
+                singular are among them: a ``ridge`` of 1e-6 lets a network go on that has few independent descriptors
+                at first, where ULRSSM's inverses return noise); also where one of several arguments that
                 need each other is missing.
         """
         if (extra_x is None) != (extra_y is None):
             raise ValueError("extra_x, extra_y: give both or none")
+        sizes = Sizes()
+        every = {
+            "feat_x": (feat_x, "... Vx C"),
+            "feat_y": (feat_y, "... Vy C"),
+            "evecs_trans_x": (evecs_trans_x, "... Kx Vx"),
+            "evecs_trans_y": (evecs_trans_y, "... Ky Vy"),
+            "evals_x": (evals_x, "... Kx"),
+            "evals_y": (evals_y, "... Ky"),
+            "evals_mask_x": (evals_mask_x, "... Kx"),
+            "evals_mask_y": (evals_mask_y, "... Ky"),
+            "extra_x": (extra_x, "... Vx E"),
+            "extra_y": (extra_y, "... Vy E"),
+            "evals_odd_x": (evals_odd_x, "... Ox"),
+            "evals_odd_y": (evals_odd_y, "... Oy"),
+            "evecs_trans_odd_x": (evecs_trans_odd_x, "... Ox Vx"),
+            "evecs_trans_odd_y": (evecs_trans_odd_y, "... Oy Vy"),
+            "evals_odd_mask_x": (evals_odd_mask_x, "... Ox"),
+            "evals_odd_mask_y": (evals_odd_mask_y, "... Oy"),
+        }
+        for name, (value, dims) in every.items():
+            if value is not None:
+                sizes.bind(name, value, dims)
+                if name.startswith("evals_mask"):
+                    require_mask(name, value)
+                elif name.startswith("evals"):
+                    require_finite(name, value)
         bases_x: list[_Basis] = [(evals_x, evecs_trans_x, evals_mask_x)]
         bases_y: list[_Basis] = [(evals_y, evecs_trans_y, evals_mask_y)]
         odd = (evals_odd_x, evals_odd_y, evecs_trans_odd_x, evecs_trans_odd_y)
@@ -133,8 +167,14 @@ class FunctionalMapSolver(nn.Module):
             bases_y.append((evals_odd_y, cast(Tensor, evecs_trans_odd_y), evals_odd_mask_y))
         elif any(part is not None for part in (*odd, evals_odd_mask_x, evals_odd_mask_y)):
             raise ValueError("evals_odd_x, evals_odd_y, evecs_trans_odd_x, evecs_trans_odd_y: give all four or none")
-        coeffs_x = [_coefficients(feat_x, extra_x, trans, "x") for _, trans, _ in bases_x]
-        coeffs_y = [_coefficients(feat_y, extra_y, trans, "y") for _, trans, _ in bases_y]
+        halves = ("", "odd_")
+        coeffs_x, coeffs_y = (
+            [
+                _coefficients(feat, extra, trans, f"evecs_trans_{half}{side}", side)
+                for (_, trans, _), half in zip(bases, halves, strict=False)
+            ]
+            for feat, extra, bases, side in ((feat_x, extra_x, bases_x, "x"), (feat_y, extra_y, bases_y, "y"))
+        )
         x, y = (coeffs_x, bases_x), (coeffs_y, bases_y)
         weights = self._with_extra(weights, feat_x, extra_x)
         found = [
@@ -170,6 +210,8 @@ class FunctionalMapSolver(nn.Module):
         return f"lmbda={shown}, commutativity={self.commutativity!r}, bidirectional={self.bidirectional}"
 
 
-def _coefficients(feat: Tensor, extra: Tensor | None, evecs_trans: Tensor, side: str) -> Tensor:
-    coeffs = descriptor_coefficients(feat, evecs_trans, side)
-    return coeffs if extra is None else torch.cat([coeffs, descriptor_coefficients(extra, evecs_trans, side)], -1)
+def _coefficients(feat: Tensor, extra: Tensor | None, evecs_trans: Tensor, basis: str, side: str) -> Tensor:
+    coeffs = descriptor_coefficients(feat, evecs_trans, (f"feat_{side}", basis))
+    if extra is None:
+        return coeffs
+    return torch.cat([coeffs, descriptor_coefficients(extra, evecs_trans, (f"extra_{side}", basis))], -1)

@@ -140,10 +140,10 @@ def heat_kernel_values(
         times: ``(n,)`` diffusion times (1 / unit of ``evals``).
         evals_mask: ``(..., K)`` true where a function is real, not padding.
     """
-    decay = torch.exp(-evals[..., :, None] * times)
+    scores = -evals[..., :, None] * times
     if evals_mask is not None:
-        decay = decay.masked_fill(~evals_mask[..., :, None], 0.0)
-    return evecs.square() @ (decay / decay.sum(-2, keepdim=True)).to(evecs.dtype)
+        scores = scores.masked_fill(~evals_mask[..., :, None], -torch.inf)
+    return evecs.square() @ torch.softmax(scores, dim=-2).to(evecs.dtype)  # no 0 / 0 where all exp underflow
 
 
 def split_descriptors(values: Sequence[Values], s: int = 5) -> list[Float[Tensor, "_V sC"]]:

@@ -135,7 +135,7 @@ def check_symmetry(
     if len(names) != 1:
         raise ValueError(f"the symmetry is given by {names or 'nothing'}: exactly one of {', '.join(given)} is allowed")
     if group is not None:
-        sizes.bind("group", group, "... G V")
+        sizes.bind("group", group, "... G V", any_dtype=True)
         _check_ids("group", group, sizes["V"], verts_mask)
         if enabled():
             own = torch.arange(sizes["V"], device=group.device)
