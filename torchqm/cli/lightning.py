@@ -1,0 +1,64 @@
+"""The LightningCLI of torchqm: which module, which data, what a run folder holds."""
+
+import warnings
+from typing import Any
+
+from pytorch_lightning.callbacks import ModelCheckpoint
+from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+
+from torchqm.data.datamodule import PairDataModule
+from torchqm.learn.callbacks import Versions
+from torchqm.learn.module import MatchModule
+from torchqm.learn.options import NetOptions
+
+__all__ = ["MatchCLI"]
+
+
+class _SaveConfig(SaveConfigCallback):
+    """The resolved configuration of a training; a test leaves that of the training as it is."""
+
+    def setup(self, trainer: Any, pl_module: Any, stage: str) -> None:
+        """Write ``config.yaml`` into the folder of a training."""
+        if stage == "fit":
+            super().setup(trainer, pl_module, stage)
+
+
+class MatchCLI(LightningCLI):
+    """One LightningCLI for everything that learns."""
+
+    @classmethod
+    def start(cls, args: list[str], run: bool = True) -> "MatchCLI":
+        """Parse and run."""
+        # It fears that arguments are given twice; here those of the command line are what is passed on.
+        warnings.filterwarnings("ignore", message="LightningCLI's args parameter")
+        return cls(
+            MatchModule,
+            PairDataModule,
+            save_config_callback=_SaveConfig,
+            save_config_kwargs={"overwrite": True},
+            seed_everything_default=0,
+            args=args,
+            run=run,
+            auto_configure_optimizers=False,
+            trainer_defaults={"callbacks": [Versions()]},
+        )
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """What model and data must agree on is given once; checkpoints are kept by the orbit error."""
+        parser.link_arguments("model.k", "data.k")
+        parser.link_arguments("seed_everything", "model.seed")
+        parser.link_arguments("seed_everything", "data.seed")
+        parser.link_arguments(("model.network", "model.gradients"), "data.keys", compute_fn=_keys)
+        parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
+        parser.set_defaults(
+            {
+                "checkpoint.monitor": "val_orbit_error",
+                "checkpoint.filename": "best-{epoch}",
+                "checkpoint.save_last": True,
+                "checkpoint.mode": "min",
+            }
+        )
+
+
+def _keys(network: str, gradients: bool) -> list[str]:
+    return list(NetOptions(network=network, gradients=gradients).keys)
