@@ -92,7 +92,8 @@ _HOMES = {
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 _SUBPACKAGES = (
-    *("checks", "data", "evaluate", "fmap", "geometry", "matching", "nn", "spectral", "symmetry", "testing", "viz"),
+    *("checks", "data", "evaluate", "fmap", "geometry", "learn", "matching", "nn", "spectral", "symmetry", "testing"),
+    "viz",
 )
 
 

@@ -26,9 +26,7 @@ def learn(args: Sequence[str], run: bool = True) -> "LightningCLI":
     try:
         from torchqm.cli.lightning import MatchCLI
     except ImportError as error:
-        raise ImportError(
-            f"learning needs the extra 'learn' (pip install 'torchqm[learn]'): {error}"
-        ) from error
+        raise ImportError(f"learning needs the extra 'learn' (pip install 'torchqm[learn]'): {error}") from error
     return MatchCLI.start(list(args), run)
 
 

@@ -7,7 +7,7 @@ from pytorch_lightning.callbacks import ModelCheckpoint
 from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 
 from torchqm.data.datamodule import PairDataModule
-from torchqm.learn.callbacks import Versions
+from torchqm.learn.callbacks import LastEpoch, Versions
 from torchqm.learn.module import MatchModule
 from torchqm.learn.options import NetOptions
 
@@ -31,6 +31,8 @@ class MatchCLI(LightningCLI):
         """Parse and run."""
         # It fears that arguments are given twice; here those of the command line are what is passed on.
         warnings.filterwarnings("ignore", message="LightningCLI's args parameter")
+        # The module moves its batches itself, since a truth in them is no tensor; it does so with other data, too.
+        warnings.filterwarnings("ignore", message="You have overridden `transfer_batch_to_device`")
         return cls(
             MatchModule,
             PairDataModule,
@@ -40,7 +42,7 @@ class MatchCLI(LightningCLI):
             args=args,
             run=run,
             auto_configure_optimizers=False,
-            trainer_defaults={"callbacks": [Versions()]},
+            trainer_defaults={"callbacks": [Versions(), LastEpoch()]},
         )
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
@@ -54,7 +56,6 @@ class MatchCLI(LightningCLI):
             {
                 "checkpoint.monitor": "val_orbit_error",
                 "checkpoint.filename": "best-{epoch}",
-                "checkpoint.save_last": True,
                 "checkpoint.mode": "min",
             }
         )

@@ -145,13 +145,13 @@ class PairDataModule(LightningDataModule):
             raise ValueError(f"dtype: {dtype!r} given, allowed are {', '.join(DTYPES)}")
         if batch_size < 1 or workers < 0:
             raise ValueError(f"batch_size={batch_size}, workers={workers}: at least 1 pair and 0 workers are needed")
-        if swapped and (truth == "none" or "group" not in keys and "symmetry" not in keys):
+        if swapped and (truth == "none" or ("group" not in keys and "symmetry" not in keys)):
             raise ValueError("swapped: needs a truth and the key 'group'")
         shares, keys = list(shares), list(keys)
         self.save_hyperparameters()
         corr = () if truth == "none" else ("corr",)
         self.options = ItemOptions(keys=(*keys, *corr), k=k, dtype=DTYPES[dtype], cache_dir=cache_dir)
-        self.parts: dict[str, Dataset[Item] | None] = {}
+        self.parts: dict[str, PairDataset | SwappedTruths | None] = {}
 
     def prepare_data(self) -> None:
         """Compute all bases once, into the cache, if there is a folder for it; called by one process only."""
@@ -214,12 +214,12 @@ class PairDataModule(LightningDataModule):
 
     def _loader(self, part: str) -> DataLoader[Item]:
         pairs, given = self.parts[part], self.hparams
-        assert pairs is not None  # noqa: S101 - asked by the callers
-        size = len(pairs)  # type: ignore[arg-type]
+        if pairs is None:
+            raise ValueError(f"shares, pairs: no pair of {given['root']} is in the part {part}")
         return DataLoader(
             pairs,
             batch_size=given["batch_size"],
-            sampler=EpochSampler(size, given["seed"]) if part == "train" else None,
+            sampler=EpochSampler(len(pairs), given["seed"]) if part == "train" else None,
             num_workers=given["workers"],
             persistent_workers=given["workers"] > 0,
             collate_fn=collate,

@@ -6,11 +6,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from pytorch_lightning import Callback, LightningModule, Trainer
+from pytorch_lightning.callbacks import ModelCheckpoint
 
 from torchqm.geometry.files import write_whole
 from torchqm.version import __version__
 
-__all__ = ["Versions", "versions"]
+__all__ = ["LastEpoch", "Versions", "versions"]
 
 _PACKAGES = ("torch", "pytorch-lightning", "jsonargparse", "numpy", "scipy")
 
@@ -24,6 +25,19 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[name] = "not installed"
     return found
+
+
+class LastEpoch(ModelCheckpoint):
+    """Keeps ``last.ckpt``, the state after the last whole epoch: what a run that was stopped goes on from.
+
+    Lightning's own ``save_last`` writes it only where a monitored value got better.
+
+    Args:
+        dirpath: folder; ``checkpoints`` in the run folder if not given.
+    """
+
+    def __init__(self, dirpath: str | Path | None = None) -> None:
+        super().__init__(dirpath, "last", save_on_train_epoch_end=True, enable_version_counter=False)
 
 
 class Versions(Callback):

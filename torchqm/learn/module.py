@@ -48,7 +48,7 @@ class MatchModule(LightningModule):
         w_truth: of the supervision.
         lr: learning rate.
         weight_decay: of Adam (decoupled).
-        seed: draws the weights and, anew in each epoch, what is random in a step.
+        seed: draws the weights and, anew in each step, what is random in it.
 
     Raises:
         ValueError: as :class:`torchqm.learn.options.NetOptions`.
@@ -93,9 +93,13 @@ class MatchModule(LightningModule):
             torch.manual_seed(seed)
             self.net = MatchNet(options)
 
-    def on_train_epoch_start(self) -> None:
-        """Draw anew in each epoch: a run that is resumed at one then goes on as if it had not stopped."""
-        torch.manual_seed(_mixed(self.hparams["seed"], self.current_epoch))
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        """The batch with its tensors on the device; a truth stays where it is, only ``corr`` is computed with."""
+        return _moved(batch, device)
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        """Draw anew in each step: what a run does in it does not depend on whether it was stopped before."""
+        torch.manual_seed(_mixed(self.hparams["seed"], self.global_step))
 
     def training_step(self, batch: Mapping[str, Any], batch_idx: int) -> Tensor:
         """The loss of a batch of pairs.
@@ -115,9 +119,7 @@ class MatchModule(LightningModule):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam."""
-        return torch.optim.AdamW(
-            self.parameters(), lr=self.hparams["lr"], weight_decay=self.hparams["weight_decay"]
-        )
+        return torch.optim.AdamW(self.parameters(), lr=self.hparams["lr"], weight_decay=self.hparams["weight_decay"])
 
     def _measure(self, stage: str, batch: Mapping[str, Any]) -> None:
         matched = self.net(batch["first"], batch["second"])
@@ -132,16 +134,25 @@ class MatchModule(LightningModule):
         loss = torch.stack(list(terms.values())).sum()
         if not bool(loss.isfinite()):
             pairs = zip(batch["first"]["name"], batch["second"]["name"], strict=True)
-            shown = ", ".join(f"{name} {float(value):g}" for name, value in terms.items())
+            shown = ", ".join(f"{name} {value.item():g}" for name, value in terms.items())
             raise FloatingPointError(
-                f"the loss is {float(loss):g} ({shown}) at the pairs {', '.join(f'{a} -> {b}' for a, b in pairs)}"
+                f"the loss is {loss.item():g} ({shown}) at the pairs {', '.join(f'{a} -> {b}' for a, b in pairs)}"
             )
         n = len(batch["first"]["name"])
-        values = {f"{stage}_loss": loss.detach(), **{f"{stage}_{name}": value.detach() for name, value in terms.items()}}
+        values = {
+            f"{stage}_loss": loss.detach(),
+            **{f"{stage}_{name}": value.detach() for name, value in terms.items()},
+        }
         self.log_dict(values, on_step=False, on_epoch=True, batch_size=n, sync_dist=True)
         return loss
 
 
-def _mixed(seed: int, epoch: int) -> int:
-    """A seed of its own for each epoch; neighbouring runs and epochs share none."""
-    return (seed * 1_000_003 + epoch) % 2**63
+def _moved(value: Any, device: torch.device) -> Any:
+    if isinstance(value, Tensor):
+        return value.to(device, non_blocking=True)
+    return {key: _moved(part, device) for key, part in value.items()} if isinstance(value, dict) else value
+
+
+def _mixed(seed: int, step: int) -> int:
+    """A seed of its own for each step; runs with neighbouring seeds share none."""
+    return (seed * 1_000_000_007 + step) % 2**63

@@ -109,7 +109,7 @@ class MatchNet(nn.Module):
             soft["yx"] = self.soft(found.points_y, found.points_x, *reversed(masks))
         maps = found.maps
         for basis_x, basis_y, xy, yx in zip(maps.bases_x, maps.bases_y, maps.fmaps_xy, maps.fmaps_yx, strict=True):
-            terms = self.usual(xy, yx, basis_x.evals, basis_y.evals, basis_x.mask, basis_y.mask)
+            terms = self._usual(basis_x, basis_y, xy, yx)
             if o.w_align > 0:
                 gap = alignment_energy(xy, soft["yx"], basis_x.evecs, basis_y.evecs_trans)
                 gap = gap + alignment_energy(yx, soft["xy"], basis_y.evecs, basis_x.evecs_trans)
@@ -127,6 +127,15 @@ class MatchNet(nn.Module):
         p2p = matched.maps.points(y["verts_mask"])
         errors = straight_errors(p2p, y["corr"], x["corr"], y["verts"], y["mass"], y["group"])
         return error_means(errors, point_weights(y["corr"], errors, x["mass"], x["corr"], x["corr_mask"]))
+
+    def _usual(self, basis_x: Basis, basis_y: Basis, xy: Tensor, yx: Tensor) -> dict[str, Tensor]:
+        """Terms of one block; a pair with no function in it (a shape without symmetry has no odd one) counts as 0."""
+        there = basis_x.mask.any(-1) & basis_y.mask.any(-1)
+        given = (xy, yx, basis_x.evals, basis_y.evals, basis_x.mask, basis_y.mask)
+        if bool(there.all()):
+            return self.usual(*given)
+        share = float(there.sum()) / len(there)
+        return {name: share * value for name, value in self.usual(*(v[there] for v in given)).items()} if share else {}
 
     def _truth(self, x: Item, y: Item, maps: PairMaps, soft_xy: Any) -> Tensor:
         given: dict[str, Any]
