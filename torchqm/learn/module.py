@@ -19,7 +19,7 @@ class MatchModule(LightningModule):
 
     Logged are ``train_loss``, ``val_loss`` and ``test_loss`` with their terms (``train_l_bij`` and so on), and where
     pairs have a truth ``plain_error``, ``orbit_error`` (straight lines through space / sqrt(area), see
-    :mod:`torchqm.fmap.straight_errors`), ``flipped_map`` and ``flipped_points``, each with ``val_`` or ``test_`` before.
+    :mod:`torchqm.fmap.straight_errors`), ``flipped_map`` and ``flipped_points``, after ``val_`` or ``test_``.
     What a run reports in the end is measured by :mod:`torchqm.evaluate`.
 
     All arguments but the last three are those of :class:`torchqm.learn.options.NetOptions`.
@@ -139,10 +139,7 @@ class MatchModule(LightningModule):
                 f"the loss is {loss.item():g} ({shown}) at the pairs {', '.join(f'{a} -> {b}' for a, b in pairs)}"
             )
         n = len(batch["first"]["name"])
-        values = {
-            f"{stage}_loss": loss.detach(),
-            **{f"{stage}_{name}": value.detach() for name, value in terms.items()},
-        }
+        values = {f"{stage}_{name}": value.detach() for name, value in {"loss": loss, **terms}.items()}
         self.log_dict(values, on_step=False, on_epoch=True, batch_size=n, sync_dist=True)
         return loss
 

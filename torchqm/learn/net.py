@@ -64,7 +64,7 @@ class MatchNet(nn.Module):
     Example:
         >>> net = MatchNet(NetOptions(setup="quotient", channels=16, width=16))
         >>> sum(p.numel() for p in net.parameters())
-        4480
+        1584
     """
 
     def __init__(self, options: NetOptions | None = None) -> None:

@@ -89,9 +89,7 @@ class NetOptions:
         if self.supervision == "plain" and self.setup != "functional_map":
             raise ValueError(f"supervision: 'plain' given for {self.setup}; it has 'orbit' and 'none'")
         if self.supervision == "orbit" and self.setup == "functional_map" and self.truth_form == "spectral":
-            raise ValueError(
-                "truth_form: 'spectral' up to symmetry needs an even block; functional_map has 'assignment'"
-            )
+            raise ValueError("truth_form: 'spectral' up to symmetry needs an even block; here there is 'assignment'")
         if self.supervision == "none" and not any((self.w_bij, self.w_orth, self.w_lap, self.w_align)):
             raise ValueError("supervision: 'none' with all weights 0 leaves no loss")
 
