@@ -2,7 +2,7 @@
 
 From two triangle meshes, all the equally good dense maps between them (Ovsjanikov, Mérigot, Pătrăucean, Guibas, "Shape
 Matching via Quotient Spaces", 2013). The names below are loaded on first use, so ``import torchqm`` is quick; all
-else is in the subpackages ``geometry, spectral, symmetry, fmap, matching, data, evaluate, viz``.
+else is in the subpackages ``geometry, spectral, symmetry, fmap, matching, nn, learn, data, evaluate, viz``.
 
 Example:
     >>> import torchqm

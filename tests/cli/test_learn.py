@@ -13,7 +13,12 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 FILES = sorted(path.relative_to(CONFIGS).as_posix() for path in CONFIGS.rglob("*.yaml"))
 TINY = [
     *("--data.root", "synthetic:kinds=ellipsoid;verts=500;triangulation=shared", "--data.shares", "[1,0,0]"),
-    *("--data.pairs", "unordered", "--data.test_root", "synthetic:kinds=ellipsoid;poses=2;verts=500;seed=1"),
+    *(
+        "--data.pairs",
+        "unordered",
+        "--data.test_root",
+        "synthetic:kinds=ellipsoid;poses=2;verts=500;triangulation=shared",
+    ),
     *("--data.whole_classes", "false", "--data.batch_size", "2"),
     *("--model.k", "10", "--model.channels", "8", "--model.width", "8", "--model.signature", "8"),
     *("--checkpoint.monitor", "null", "--trainer.max_epochs", "1", "--trainer.num_sanity_val_steps", "0"),
@@ -68,6 +73,7 @@ def test_a_run_folder_holds_everything_and_is_tested_from_it(tmp_path, monkeypat
     assert set(tested.trainer.callback_metrics) >= {"test_loss", "test_orbit_error", "test_flipped_map"}
     assert all(torch.equal(a, b) for a, b in zip(module.parameters(), tested.model.parameters(), strict=True))
     assert (folder / "config.yaml").read_bytes() == before
+    assert yaml.safe_load((folder.with_name("version_1") / "config.yaml").read_text())["model"]["channels"] == 8
 
 
 def test_a_folder_that_is_no_run_is_named(tmp_path):

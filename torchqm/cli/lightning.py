@@ -1,10 +1,9 @@
 """The LightningCLI of torchqm: which module, which data, what a run folder holds."""
 
 import warnings
-from typing import Any
 
 from pytorch_lightning.callbacks import ModelCheckpoint
-from pytorch_lightning.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from pytorch_lightning.cli import LightningArgumentParser, LightningCLI
 
 from torchqm.data.datamodule import PairDataModule
 from torchqm.learn.callbacks import LastEpoch, Versions
@@ -12,15 +11,6 @@ from torchqm.learn.module import MatchModule
 from torchqm.learn.options import NetOptions
 
 __all__ = ["MatchCLI"]
-
-
-class _SaveConfig(SaveConfigCallback):
-    """The resolved configuration of a training; a test leaves that of the training as it is."""
-
-    def setup(self, trainer: Any, pl_module: Any, stage: str) -> None:
-        """Write ``config.yaml`` into the folder of a training."""
-        if stage == "fit":
-            super().setup(trainer, pl_module, stage)
 
 
 class MatchCLI(LightningCLI):
@@ -36,7 +26,6 @@ class MatchCLI(LightningCLI):
         return cls(
             MatchModule,
             PairDataModule,
-            save_config_callback=_SaveConfig,
             save_config_kwargs={"overwrite": True},
             seed_everything_default=0,
             args=args,
