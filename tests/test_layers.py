@@ -21,7 +21,7 @@ def test_layer_contract():
 
 HEAVY = (
     *("matplotlib", "gudhi", "sklearn", "skimage", "trimesh", "potpourri3d", "faiss", "robust_laplacian"),
-    *("torchmetrics", "yaml", "joblib", "dask", "distributed"),
+    *("torchmetrics", "yaml", "joblib", "dask", "distributed", "pytorch_lightning", "jsonargparse"),
 )
 
 
@@ -31,7 +31,7 @@ HEAVY = (
         ("torchqm", ("torch", "numpy", "scipy", *HEAVY)),
         ("torchqm.cli.main", ("torch", "numpy", "scipy", *HEAVY)),
         (
-            "torchqm.matching.baselines, torchqm.evaluate, torchqm.data, torchqm.viz, torchqm.testing",
+            "torchqm.matching.baselines, torchqm.evaluate, torchqm.data, torchqm.viz, torchqm.testing, torchqm.learn",
             HEAVY,
         ),
     ],

@@ -37,7 +37,7 @@ def test_constraints_name_a_version_of_every_dependency():
     """A fresh installation gets the versions that the tests passed with."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = {
-        line.split(">=")[0].split("==")[0].strip().lower().replace("_", "-")
+        line.split(">=")[0].split("==")[0].split("[")[0].strip().lower().replace("_", "-")
         for line in [*project["dependencies"], *project["optional-dependencies"]["test"]]
     }
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if line and not line.startswith("#")]

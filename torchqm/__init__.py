@@ -2,7 +2,7 @@
 
 From two triangle meshes, all the equally good dense maps between them (Ovsjanikov, Mérigot, Pătrăucean, Guibas, "Shape
 Matching via Quotient Spaces", 2013). The names below are loaded on first use, so ``import torchqm`` is quick; all
-else is in the subpackages ``geometry, spectral, symmetry, fmap, matching, data, evaluate, viz``.
+else is in the subpackages ``geometry, spectral, symmetry, fmap, matching, nn, learn, data, evaluate, viz``.
 
 Example:
     >>> import torchqm
@@ -92,7 +92,8 @@ _HOMES = {
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 _SUBPACKAGES = (
-    *("checks", "data", "evaluate", "fmap", "geometry", "matching", "nn", "spectral", "symmetry", "testing", "viz"),
+    *("checks", "data", "evaluate", "fmap", "geometry", "learn", "matching", "nn", "spectral", "symmetry", "testing"),
+    "viz",
 )
 
 

@@ -1,0 +1,93 @@
+import pytest
+import torch
+
+from torchqm.data import PairDataset, open_shapes, write_split_file
+from torchqm.data.datamodule import EpochSampler, PairDataModule, SwappedTruths
+from torchqm.data.items import ItemOptions
+from torchqm.data.splits import Split
+
+ROOT = "synthetic:kinds=ellipsoid;poses=3;verts=500;triangulation=shared"
+NAMES = [f"ellipsoid-0-pose{pose}" for pose in range(3)]
+
+
+def module(**given):
+    return PairDataModule(**({"root": ROOT, "k": 8, "shares": (1, 0, 0)} | given))
+
+
+def test_epochs_have_orders_of_their_own_that_only_the_seed_changes():
+    sampler = EpochSampler(20, seed=3)
+    orders = []
+    for epoch in (0, 1, 0):
+        sampler.set_epoch(epoch)
+        orders.append(list(sampler))
+    assert orders[0] == orders[2] != orders[1]
+    assert sorted(orders[1]) == list(range(20)) == sorted(EpochSampler(20, seed=4))
+    assert list(EpochSampler(20, seed=4)) != orders[0]
+
+
+def test_batches_are_those_of_the_split_and_its_options(tmp_path):
+    split = write_split_file(tmp_path / "split.yaml", Split(train=tuple(NAMES[:2]), test=(NAMES[0], NAMES[2])[1:]))
+    data = module(split=str(split), batch_size=2, test_root=ROOT, pairs="unordered", dtype="float64")
+    data.setup("fit")
+    (batch,) = data.train_dataloader()
+    assert (batch["first"]["name"], batch["second"]["name"]) == ([NAMES[0]], [NAMES[1]])
+    assert batch["first"]["evecs"].shape[-1] == 8
+    assert batch["first"]["evecs"].dtype == torch.float64
+    assert data.val_dataloader() == []
+    assert [len(part["first"]["name"]) for part in data.test_dataloader()] == [2, 1]
+
+
+def test_bases_are_computed_once_into_the_cache(tmp_path):
+    data = module(cache_dir=str(tmp_path))
+    data.prepare_data()
+    files = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+    assert len([path for path in files if path.suffix == ".npz"]) == 3
+    data.setup("fit")
+    for _ in data.train_dataloader():
+        pass
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()} == files
+
+
+def test_truths_are_swapped_in_the_share_that_was_asked_for():
+    options = ItemOptions(keys=("group", "corr"), dtype=torch.float32)
+    pairs = PairDataset(open_shapes(ROOT), options=options)
+    wrong = SwappedTruths(pairs, 0.5, seed=1)
+    assert len(wrong.swapped) == len(pairs) // 2 == 3
+    for number in range(len(pairs)):
+        true, found = pairs[number], wrong[number]
+        group, corr = true["second"]["group"], found["second"]["corr"]
+        elements = [g for g in range(len(group)) if torch.equal(group[g][true["second"]["corr"]], corr)]
+        assert (elements == [0]) == (number not in wrong.swapped)
+        assert len(elements) == 1
+        assert torch.equal(wrong[number]["second"]["corr"], corr)  # drawn once, and the kept item stays as it was
+    assert SwappedTruths(pairs, 0.5, seed=1).swapped == wrong.swapped
+    with pytest.raises(ValueError, match=r"share: 1\.5 given"):
+        SwappedTruths(pairs, 1.5)
+
+
+def test_only_training_pairs_are_swapped():
+    data = module(shares=(0.4, 0.6, 0), swapped=1.0, pairs="all+self")
+    data.setup("fit")
+    assert isinstance(data.parts["train"], SwappedTruths)
+    assert isinstance(data.parts["validation"], PairDataset)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"dtype": "half"}, "dtype: 'half' given, allowed are float32, float64"),
+        ({"batch_size": 0}, "batch_size=0"),
+        ({"swapped": 0.5, "truth": "none"}, "swapped: needs a truth"),
+        ({"swapped": 0.5, "keys": ("mass",)}, "swapped: needs a truth and the key 'group'"),
+    ],
+)
+def test_bad_values_are_named(given, message):
+    with pytest.raises(ValueError, match=message):
+        module(**given)
+
+
+def test_a_part_without_pairs_is_an_error_when_it_is_needed():
+    with pytest.raises(ValueError, match="pairs: none left"):
+        module(shares=(0, 1, 0)).setup("fit")
+    with pytest.raises(ValueError, match="split: 'own' given, but synthetic:"):
+        module(split="own").setup("fit")

@@ -1,0 +1,115 @@
+import pytest
+import torch
+from pytorch_lightning import Callback, Trainer
+from torch.utils.data import DataLoader
+
+from torchqm.data import collate
+from torchqm.learn import MatchModule
+from torchqm.learn.callbacks import LastEpoch
+
+SMALL = {"k": 20, "signature": 16, "channels": 12, "width": 24, "odd_pairs": 20, "dropout": 0.2}
+
+
+class Shuffled(torch.utils.data.Sampler):
+    """An order for each epoch, as that of torchqm.data.datamodule, which this floor does not know."""
+
+    def __init__(self):
+        self.epoch = 0
+
+    def set_epoch(self, epoch):
+        self.epoch = epoch
+
+    def __len__(self):
+        return 2
+
+    def __iter__(self):
+        return iter([0, 1] if self.epoch % 2 else [1, 0])
+
+
+class Killed(Callback):
+    """Ends the run in the middle of its second epoch."""
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        if trainer.global_step == 3:
+            raise RuntimeError("killed")
+
+
+def loaders(pairs):
+    single = [
+        {side: {k: v.float() if torch.is_tensor(v) and v.is_floating_point() else v for k, v in pair[side].items()}
+         for side in ("first", "second")} | {"truth": pair["truth"]}
+        for pair in pairs
+    ]  # fmt: skip
+    return DataLoader(single, sampler=Shuffled(), collate_fn=collate), DataLoader(single, collate_fn=collate)
+
+
+def trainer(folder, epochs, *callbacks, checkpoints=True):
+    kept = [LastEpoch(folder)] if checkpoints else []
+    return Trainer(
+        accelerator="cpu", max_epochs=epochs, logger=False, callbacks=[*kept, *callbacks], num_sanity_val_steps=0,
+        enable_checkpointing=checkpoints, enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
+
+
+def fit(folder, pairs, epochs, *callbacks, seed=0, ckpt_path=None, checkpoints=True):
+    torch.manual_seed(seed + 17)  # whatever was drawn before does not matter
+    module = MatchModule("quotient+odd", seed=seed, **SMALL)
+    run = trainer(folder, epochs, *callbacks, checkpoints=checkpoints)
+    run.fit(module, *loaders(pairs), ckpt_path=ckpt_path, weights_only=None if ckpt_path is None else True)
+    return module, run
+
+
+def same(a, b):
+    return all(torch.equal(u, v) for u, v in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, pairs):
+    """An uninterrupted run of three epochs."""
+    folder = tmp_path_factory.mktemp("whole")
+    return *fit(folder, pairs, 3), folder
+
+
+def test_a_run_that_is_killed_and_resumed_ends_where_the_uninterrupted_one_does(whole, pairs, tmp_path):
+    with pytest.raises(RuntimeError, match="killed"):
+        fit(tmp_path, pairs, 3, Killed())
+    torch.rand(5)
+    resumed, run = fit(tmp_path, pairs, 3, ckpt_path=tmp_path / "last.ckpt")
+    assert run.global_step == 6
+    assert same(resumed, whole[0])
+
+
+def test_the_seed_decides_weights_and_course(whole, pairs, tmp_path):
+    again, _ = fit(tmp_path, pairs, 3, checkpoints=False)
+    assert same(again, whole[0])
+    first, other = (MatchModule("quotient+odd", seed=seed, **SMALL) for seed in (0, 1))
+    assert not same(first, other)
+    assert not same(first, whole[0])
+
+
+def test_a_checkpoint_holds_the_module_and_nothing_that_needs_pickle(whole):
+    module, _, folder = whole
+    loaded = MatchModule.load_from_checkpoint(folder / "last.ckpt", weights_only=True)
+    assert same(loaded, module)
+    assert dict(loaded.hparams) == dict(module.hparams)
+    assert loaded.hparams["setup"] == "quotient+odd"
+
+
+def test_what_is_logged_are_the_losses_and_errors_of_the_network(whole, pairs):
+    module, run, _ = whole
+    assert {"train_loss", "train_l_bij", "val_loss", "val_l_align", "val_plain_error", "val_flipped_points"} <= set(
+        run.callback_metrics
+    )
+    module.eval()
+    each = [(batch, module.net(batch["first"], batch["second"])) for batch in loaders(pairs)[1]]
+    wanted = sum(module.net.errors(*pair)["orbit_error"].item() for pair in each) / len(each)
+    assert run.callback_metrics["val_orbit_error"].item() == pytest.approx(wanted, rel=1e-4)
+    loss = sum(sum(module.net.losses(*pair).values()).item() for pair in each) / len(each)
+    assert run.callback_metrics["val_loss"].item() == pytest.approx(loss, rel=1e-4)
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_and_names_the_pairs(pairs, tmp_path):
+    module = MatchModule("quotient", **SMALL)
+    module.net.options.__dict__["w_align"] = float("inf")
+    with pytest.raises(FloatingPointError, match=r"the loss is inf .*l_align inf.*quadruped-0-pose0 -> quadruped-0-po"):
+        trainer(tmp_path, 1, checkpoints=False).fit(module, *loaders(pairs))

@@ -1,0 +1,122 @@
+from itertools import pairwise
+
+import pytest
+import torch
+
+from torchqm.data import collate
+from torchqm.learn import MatchNet, NetOptions
+
+SMALL = {"k": 20, "signature": 16, "channels": 12, "width": 24, "odd_pairs": 20}
+KINDS = [
+    ("functional_map", "none", "spectral"),
+    ("functional_map", "plain", "spectral"),
+    ("functional_map", "plain", "assignment"),
+    ("functional_map", "orbit", "assignment"),
+    ("quotient", "none", "spectral"),
+    ("quotient", "orbit", "spectral"),
+    ("quotient", "orbit", "assignment"),
+    ("quotient+odd", "none", "spectral"),
+    ("quotient+odd", "orbit", "spectral"),
+    ("quotient+odd", "orbit", "assignment"),
+]
+
+
+def net_of(setup, supervision="none", truth_form="spectral", **more):
+    torch.manual_seed(0)
+    options = NetOptions(setup=setup, supervision=supervision, truth_form=truth_form, **(SMALL | more))
+    return MatchNet(options).double()
+
+
+def steps(net, batch, n=4):
+    optimizer, losses = torch.optim.Adam(net.parameters(), 3e-3), []
+    for _ in range(n):
+        terms = net.losses(batch)
+        loss = sum(terms.values())
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append({name: value.item() for name, value in (terms | {"loss": loss}).items()})
+    return losses
+
+
+@pytest.mark.parametrize(("setup", "supervision", "truth_form"), KINDS)
+def test_every_setup_lowers_its_loss(setup, supervision, truth_form, pairs):
+    losses = steps(net_of(setup, supervision, truth_form), collate(pairs))
+    for name in ("loss", *(() if supervision == "none" else ("l_truth",))):
+        assert all(after[name] < before[name] for before, after in pairwise(losses)), name
+    assert set(losses[0]) == {"l_bij", "l_orth", "l_lap", "l_align", "loss"} | (
+        set() if supervision == "none" else {"l_truth"}
+    )
+
+
+@pytest.mark.parametrize("network", ["mlp", "diffusion"])
+@pytest.mark.parametrize(("setup", "supervision", "truth_form"), [KINDS[2], KINDS[5], KINDS[9]])
+def test_a_padded_batch_is_the_mean_of_its_pairs(setup, supervision, truth_form, network, pairs):
+    net = net_of(setup, supervision, truth_form, network=network)
+    batch, each = collate(pairs), [collate([pair]) for pair in pairs]
+    assert not batch["first"]["verts_mask"].all()
+    together = net.losses(batch)
+    alone = [net.losses(one) for one in each]
+    for name, value in together.items():
+        torch.testing.assert_close(value, sum(terms[name] for terms in alone) / 2, rtol=1e-8, atol=1e-8)
+    grads = torch.autograd.grad(sum(together.values()), list(net.parameters()))
+    single = torch.autograd.grad(sum(sum(terms.values()) for terms in alone) / 2, list(net.parameters()))
+    for found, wanted in zip(grads, single, strict=True):
+        torch.testing.assert_close(found, wanted, rtol=1e-6, atol=1e-8)
+    errors = net.errors(batch, net(batch["first"], batch["second"]))
+    for b, one in enumerate(each):
+        for name, value in net.errors(one, net(one["first"], one["second"])).items():
+            if setup == "quotient" and name != "orbit_error":
+                continue  # which point of an orbit comes back is for rounding to say
+            torch.testing.assert_close(errors[name][b], value[0])
+
+
+def swapped(pair):
+    second = pair["second"]
+    return pair | {"second": second | {"corr": second["group"][1][second["corr"]]}}
+
+
+@pytest.mark.parametrize(("setup", "supervision", "truth_form"), [kind for kind in KINDS if kind[1] != "none"])
+def test_swapped_truths_change_the_plain_loss_only(setup, supervision, truth_form, pairs):
+    net = net_of(setup, supervision, truth_form, inputs=("wks", "xyz"))  # features of even inputs cannot tell
+    with torch.no_grad():
+        true, wrong = (net.losses(collate(list(given)))["l_truth"].item() for given in (pairs, map(swapped, pairs)))
+    assert (abs(wrong - true) < 1e-9 * true) == (supervision == "orbit")
+    assert (abs(wrong - true) > 1e-3 * true) == (supervision == "plain")
+
+
+def test_the_joined_map_is_direct_and_the_full_one_is_not(pairs):
+    batch = collate(pairs)
+    errors = {}
+    for setup in ("functional_map", "quotient+odd"):
+        net = net_of(setup)
+        steps(net, batch, 6)
+        errors[setup] = net.errors(batch, net(batch["first"], batch["second"]))
+    odd, full = errors["quotient+odd"], errors["functional_map"]
+    assert odd["flipped_map"].sum() == 0
+    assert odd["flipped_points"].max() < 0.1 < full["flipped_points"].min()
+    assert (odd["plain_error"] < full["plain_error"]).all()
+
+
+def test_one_shape_without_symmetry_changes_nothing_for_the_others(pairs):
+    plain = {side: pairs[1][side] | {"group": pairs[1][side]["group"][:1]} for side in ("first", "second")}
+    net = net_of("quotient+odd")
+    mixed = net.losses(collate([{side: pairs[0][side] for side in ("first", "second")}, plain]))
+    alone = [net.losses(collate([pair])) for pair in (pairs[0], plain)]
+    for name, value in mixed.items():
+        torch.testing.assert_close(value, sum(terms[name] for terms in alone) / 2, rtol=1e-8, atol=1e-8)
+
+
+def test_shapes_without_symmetry_have_an_empty_odd_block(pairs):
+    trivial = [
+        {side: pair[side] | {"group": pair[side]["group"][:1]} for side in ("first", "second")} for pair in pairs
+    ]
+    net = net_of("quotient+odd")
+    batch = collate(trivial)
+    matched = net(batch["first"], batch["second"])
+    assert matched.maps.fmaps_xy[1].numel() == 0
+    loss = sum(net.losses(batch, matched).values())
+    loss.backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in net.parameters())
+    full = net_of("functional_map").losses(batch)
+    torch.testing.assert_close(net.losses(batch, matched)["l_lap"], full["l_lap"], rtol=1e-6, atol=1e-8)

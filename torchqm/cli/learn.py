@@ -1,0 +1,53 @@
+"""Training and testing from YAML: one LightningCLI; needs the extra ``learn`` (pytorch-lightning, jsonargparse)."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pytorch_lightning.cli import LightningCLI
+
+__all__ = ["evaluate", "fit", "learn"]
+
+CONFIG_NAME = "config.yaml"
+
+
+def learn(args: Sequence[str], run: bool = True) -> "LightningCLI":
+    """Parse ``fit --config FILE ...`` or ``test ...`` and do it.
+
+    Args:
+        args: what stands on the command line, the name of the subcommand first.
+        run: false: parse, build everything, do nothing; then ``args`` has no subcommand.
+
+    Raises:
+        ImportError: the extra is not installed.
+        SystemExit: an argument that is wrong, with a message that names it.
+    """
+    try:
+        from torchqm.cli.lightning import MatchCLI
+    except ImportError as error:
+        raise ImportError(f"learning needs the extra 'learn' (pip install 'torchqm[learn]'): {error}") from error
+    return MatchCLI.start(list(args), run)
+
+
+def fit(args: Sequence[str]) -> "LightningCLI":
+    """Train: ``--config FILE [--model.lr 1e-3 ...] [--ckpt_path RUN/checkpoints/last.ckpt]``."""
+    return learn(["fit", *args])
+
+
+def evaluate(args: Sequence[str]) -> "LightningCLI":
+    """Test: ``RUN [--data.root ...]``, RUN the folder of a training; its best checkpoint, or its last, is taken.
+
+    Raises:
+        ValueError: the folder is no run, or has no checkpoint.
+    """
+    if not args or args[0].startswith("-"):
+        return learn(["test", *args])
+    folder = Path(args[0])
+    if not (folder / CONFIG_NAME).is_file():
+        raise ValueError(f"{folder}: no folder of a run; {CONFIG_NAME} is missing")
+    found = sorted((folder / "checkpoints").glob("best*.ckpt")) or sorted((folder / "checkpoints").glob("*.ckpt"))
+    if not found:
+        raise ValueError(f"{folder}: no checkpoint in {folder / 'checkpoints'}")
+    own = ["--config", str(folder / CONFIG_NAME), "--ckpt_path", str(found[-1])]
+    return learn(["test", *own, *args[1:]])

@@ -1,0 +1,155 @@
+"""The matcher as a LightningModule."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import torch
+from pytorch_lightning import LightningModule
+from torch import Tensor
+
+from torchqm.learn.net import MatchNet
+from torchqm.learn.options import NetOptions
+
+__all__ = ["MatchModule"]
+
+
+class MatchModule(LightningModule):
+    """Trains a :class:`torchqm.learn.net.MatchNet` with Adam and logs what becomes of it.
+
+    Logged are ``train_loss``, ``val_loss`` and ``test_loss`` with their terms (``train_l_bij`` and so on), and where
+    pairs have a truth ``plain_error``, ``orbit_error`` (straight lines through space / sqrt(area), see
+    :mod:`torchqm.fmap.straight_errors`), ``flipped_map`` and ``flipped_points``, after ``val_`` or ``test_``.
+    What a run reports in the end is measured by :mod:`torchqm.evaluate`.
+
+    All arguments but the last three are those of :class:`torchqm.learn.options.NetOptions`.
+
+    Args:
+        setup: ``functional_map``, ``quotient`` or ``quotient+odd``.
+        supervision: ``none``, ``orbit`` or ``plain``.
+        truth_form: ``spectral`` or ``assignment``.
+        inputs: names of input features.
+        signature: energies of a wave kernel signature, times of a heat kernel signature.
+        k: eigenfunctions of the bases.
+        network: ``mlp`` or ``diffusion``.
+        channels: of the features.
+        width: channels inside the network.
+        blocks: of ``diffusion``; hidden layers of ``mlp``.
+        dropout: probability.
+        gradients: ``diffusion``: use products of gradients.
+        rotations: ``diffusion``: let them see the orientation.
+        odd_pairs: odd descriptors, at most.
+        lmbda: weight of commutativity in the solver.
+        tau: temperature of the soft point maps.
+        w_bij: weight of bijectivity in the loss.
+        w_orth: of orthogonality.
+        w_lap: of commutativity.
+        w_align: of the agreement of soft and functional maps.
+        w_truth: of the supervision.
+        lr: learning rate.
+        weight_decay: of Adam (decoupled).
+        seed: draws the weights and, anew in each step, what is random in it.
+
+    Raises:
+        ValueError: as :class:`torchqm.learn.options.NetOptions`.
+
+    Example:
+        >>> MatchModule(setup="quotient", k=20).hparams.setup
+        'quotient'
+    """
+
+    def __init__(
+        self,
+        setup: str = "quotient+odd",
+        supervision: str = "none",
+        truth_form: str = "spectral",
+        inputs: Sequence[str] = ("wks",),
+        signature: int = 64,
+        k: int = 60,
+        network: str = "mlp",
+        channels: int = 64,
+        width: int = 128,
+        blocks: int = 2,
+        dropout: float = 0.0,
+        gradients: bool = True,
+        rotations: bool = False,
+        odd_pairs: int = 64,
+        lmbda: float = 100.0,
+        tau: float = 0.07,
+        w_bij: float = 1.0,
+        w_orth: float = 1.0,
+        w_lap: float = 1e-3,
+        w_align: float = 1.0,
+        w_truth: float = 1.0,
+        lr: float = 1e-3,
+        weight_decay: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        inputs = list(inputs)  # a tuple would not come back from a file as one
+        self.save_hyperparameters()
+        options = NetOptions(**{field.name: self.hparams[field.name] for field in fields(NetOptions)})
+        with torch.random.fork_rng(devices=[]):  # the weights depend on the seed alone, not on what was drawn before
+            torch.manual_seed(seed)
+            self.net = MatchNet(options)
+
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        """The batch with its tensors on the device; a truth stays where it is, only ``corr`` is computed with."""
+        return _moved(batch, device)
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        """Draw anew in each step: what a run does in it does not depend on whether it was stopped before."""
+        torch.manual_seed(_mixed(self.hparams["seed"], self.global_step))
+
+    def training_step(self, batch: Mapping[str, Any], batch_idx: int) -> Tensor:
+        """The loss of a batch of pairs.
+
+        Raises:
+            FloatingPointError: it is not finite; the pairs are named.
+        """
+        return self._log("train", self.net.losses(batch), batch)
+
+    def validation_step(self, batch: Mapping[str, Any], batch_idx: int) -> None:
+        """Log loss and errors."""
+        self._measure("val", batch)
+
+    def test_step(self, batch: Mapping[str, Any], batch_idx: int) -> None:
+        """Log loss and errors."""
+        self._measure("test", batch)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Adam."""
+        return torch.optim.AdamW(self.parameters(), lr=self.hparams["lr"], weight_decay=self.hparams["weight_decay"])
+
+    def _measure(self, stage: str, batch: Mapping[str, Any]) -> None:
+        matched = self.net(batch["first"], batch["second"])
+        self._log(stage, self.net.losses(batch, matched), batch)
+        if "corr" not in batch["first"] or not bool(batch["first"]["corr_mask"].any(-1).all()):
+            return  # a pair without truth has no error
+        errors = self.net.errors(batch, matched)
+        means = {f"{stage}_{name}": value.mean() for name, value in errors.items()}
+        self.log_dict(means, batch_size=len(batch["first"]["name"]), sync_dist=True)
+
+    def _log(self, stage: str, terms: Mapping[str, Tensor], batch: Mapping[str, Any]) -> Tensor:
+        loss = torch.stack(list(terms.values())).sum()
+        if not bool(loss.isfinite()):
+            pairs = zip(batch["first"]["name"], batch["second"]["name"], strict=True)
+            shown = ", ".join(f"{name} {value.item():g}" for name, value in terms.items())
+            raise FloatingPointError(
+                f"the loss is {loss.item():g} ({shown}) at the pairs {', '.join(f'{a} -> {b}' for a, b in pairs)}"
+            )
+        n = len(batch["first"]["name"])
+        values = {f"{stage}_{name}": value.detach() for name, value in {"loss": loss, **terms}.items()}
+        self.log_dict(values, on_step=False, on_epoch=True, batch_size=n, sync_dist=True)
+        return loss
+
+
+def _moved(value: Any, device: torch.device) -> Any:
+    if isinstance(value, Tensor):
+        return value.to(device, non_blocking=True)
+    return {key: _moved(part, device) for key, part in value.items()} if isinstance(value, dict) else value
+
+
+def _mixed(seed: int, step: int) -> int:
+    """A seed of its own for each step; runs with neighbouring seeds share none."""
+    return (seed * 1_000_000_007 + step) % 2**63

@@ -1,0 +1,155 @@
+"""The network of a matcher, in bare torch: features, maps, and the losses they are trained with."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+from torchqm.fmap.alignment import alignment_energy
+from torchqm.fmap.orbit_truth import point_weights
+from torchqm.fmap.straight_errors import error_means, straight_errors
+from torchqm.geometry.mean_square import unit_mean_square
+from torchqm.learn.features import FeatureNet
+from torchqm.learn.maps import Basis, PairMaps, bases_of, solved_maps
+from torchqm.learn.options import NetOptions
+from torchqm.nn import (
+    FunctionalMapLoss,
+    FunctionalMapSolver,
+    OrientationDescriptors,
+    PointToOrbitLoss,
+    SoftPointMap,
+    SymmetrizedBasis,
+)
+
+__all__ = ["MatchNet", "Matched"]
+
+Item = Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """What the network makes of a batch of pairs.
+
+    Args:
+        maps: functional maps in both directions.
+        points_x: ``(B, X, D)`` what the soft point maps compare: the features and, with an odd block, its descriptors.
+        points_y: ``(B, Y, D)``.
+    """
+
+    maps: PairMaps
+    points_x: Float[Tensor, "B X D"]
+    points_y: Float[Tensor, "B Y D"]
+
+
+class MatchNet(nn.Module):
+    """Features of two shapes and the maps between them, with the losses of one of three set-ups.
+
+    * ``functional_map``: one map in the full bases, as the usual learned pipelines have it.
+    * ``quotient``: one map between the even functions: where an orbit goes, and nothing of left and right.
+    * ``quotient+odd``: an even and an odd block. The odd one comes from
+      :class:`torchqm.nn.OrientationDescriptors` of the features, so that the joined map is the direct one.
+
+    The loss is the sum of the terms with a weight above 0, each a mean over the pairs: ``l_bij, l_orth, l_lap``
+    (:class:`torchqm.nn.FunctionalMapLoss`) and ``l_align`` (:func:`torchqm.fmap.alignment.alignment_energy`) over
+    blocks and directions, and with a supervision ``l_truth`` (:class:`torchqm.nn.PointToOrbitLoss`). A plain
+    supervision is the same loss with the group of one element, or with the spectral form in the full bases.
+
+    Args:
+        options: all plain values.
+
+    Example:
+        >>> net = MatchNet(NetOptions(setup="quotient", channels=16, width=16))
+        >>> sum(p.numel() for p in net.parameters())
+        1584
+    """
+
+    def __init__(self, options: NetOptions | None = None) -> None:
+        super().__init__()
+        self.options = o = options or NetOptions()
+        self.features = FeatureNet(o)
+        self.solver = FunctionalMapSolver(o.lmbda, bidirectional=True)
+        self.soft = SoftPointMap(o.tau)
+        self.usual = FunctionalMapLoss(o.w_bij, o.w_orth, o.w_lap)
+        self.truth = PointToOrbitLoss(o.truth_form)
+        self.split = None if o.setup == "functional_map" else SymmetrizedBasis()
+        self.odd = OrientationDescriptors(o.channels, min(o.odd_pairs, o.channels * (o.channels - 1) // 2))
+
+    def forward(self, x: Item, y: Item) -> Matched:
+        """Maps between the shapes of two padded batches of :func:`torchqm.data.collate`."""
+        with_odd = self.options.setup == "quotient+odd"
+        (feat_x, bases_x), (feat_y, bases_y) = (
+            (normalize(self.features(item), dim=-1), bases_of(item, self.split, with_odd)) for item in (x, y)
+        )
+        if not with_odd:
+            return Matched(solved_maps(self.solver, feat_x, feat_y, bases_x, bases_y), feat_x, feat_y)
+        odd_x, odd_y = self._odd(feat_x, x, bases_x[1]), self._odd(feat_y, y, bases_y[1])
+        maps = solved_maps(self.solver, feat_x, feat_y, bases_x, bases_y, odd_x, odd_y)
+        points = (normalize(torch.cat(pair, -1), dim=-1) for pair in ((feat_x, odd_x), (feat_y, odd_y)))
+        return Matched(maps, *points)
+
+    def losses(self, batch: Mapping[str, Any], matched: Matched | None = None) -> dict[str, Float[Tensor, ""]]:
+        """The terms of the loss by name, weighted; each a mean over the pairs of the batch.
+
+        Args:
+            batch: pairs of :func:`torchqm.data.collate`; with a supervision, both shapes have ``corr``.
+            matched: what :meth:`forward` made of it, if that is known already.
+        """
+        x, y, o = batch["first"], batch["second"], self.options
+        found = self(x, y) if matched is None else matched
+        total: dict[str, Tensor] = {}
+        soft: dict[str, Any] = {}
+        if o.w_align > 0 or (o.supervision != "none" and o.truth_form != "spectral"):
+            masks = x["verts_mask"], y["verts_mask"]
+            soft["xy"] = self.soft(found.points_x, found.points_y, *masks)
+        if o.w_align > 0:
+            soft["yx"] = self.soft(found.points_y, found.points_x, *reversed(masks))
+        maps = found.maps
+        for basis_x, basis_y, xy, yx in zip(maps.bases_x, maps.bases_y, maps.fmaps_xy, maps.fmaps_yx, strict=True):
+            terms = self._usual(basis_x, basis_y, xy, yx)
+            if o.w_align > 0:
+                gap = alignment_energy(xy, soft["yx"], basis_x.evecs, basis_y.evecs_trans)
+                gap = gap + alignment_energy(yx, soft["xy"], basis_y.evecs, basis_x.evecs_trans)
+                terms["l_align"] = o.w_align * gap.mean()
+            for name, value in terms.items():
+                total[name] = total[name] + value if name in total else value
+        if o.supervision != "none":
+            total["l_truth"] = o.w_truth * self._truth(x, y, maps, soft.get("xy"))
+        return total
+
+    @torch.no_grad()
+    def errors(self, batch: Mapping[str, Any], matched: Matched) -> dict[str, Float[Tensor, " B"]]:
+        """Quick errors of the point maps, for each pair: :func:`torchqm.fmap.straight_errors.error_means`."""
+        x, y = batch["first"], batch["second"]
+        p2p = matched.maps.points(y["verts_mask"])
+        errors = straight_errors(p2p, y["corr"], x["corr"], y["verts"], y["mass"], y["group"])
+        return error_means(errors, point_weights(y["corr"], errors, x["mass"], x["corr"], x["corr_mask"]))
+
+    def _usual(self, basis_x: Basis, basis_y: Basis, xy: Tensor, yx: Tensor) -> dict[str, Tensor]:
+        """Terms of one block; a pair with no function in it (a shape without symmetry has no odd one) counts as 0."""
+        there = basis_x.mask.any(-1) & basis_y.mask.any(-1)
+        given = (xy, yx, basis_x.evals, basis_y.evals, basis_x.mask, basis_y.mask)
+        if bool(there.all()):
+            return self.usual(*given)
+        share = float(there.sum()) / len(there)
+        return {name: share * value for name, value in self.usual(*(v[there] for v in given)).items()} if share else {}
+
+    def _truth(self, x: Item, y: Item, maps: PairMaps, soft_xy: Any) -> Tensor:
+        given: dict[str, Any]
+        if self.options.truth_form == "spectral":
+            given = {"fmap_even": maps.fmaps_xy[0]}
+            given |= {"evecs_even_x": maps.bases_x[0].evecs, "evecs_even_y": maps.bases_y[0].evecs}
+        elif self.options.supervision == "plain":
+            given = {"soft_xy": soft_xy, "group_y": y["group"][:, :1]}
+        else:
+            given = {"soft_xy": soft_xy, "group_y": y["group"], "group_mask": y["group_mask"]}
+        loss: Tensor = self.truth(y["corr"], x["mass"], samples=x["corr"], truth_mask=x["corr_mask"], **given)
+        return loss
+
+    def _odd(self, feat: Tensor, item: Item, basis: Basis) -> Tensor:
+        """Odd descriptors without what the odd basis does not hold, which is noise of the triangulation."""
+        raw = self.odd(feat, item["faces"], item["mass"])
+        return unit_mean_square(basis.evecs @ (basis.evecs_trans @ raw), item["mass"])

@@ -1,0 +1,100 @@
+"""The options of the network and of its losses: plain values, so that a file can hold them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+__all__ = ["NETWORKS", "SETUPS", "SUPERVISIONS", "NetOptions"]
+
+SETUPS = ("functional_map", "quotient", "quotient+odd")
+SUPERVISIONS = ("none", "orbit", "plain")
+NETWORKS = ("mlp", "diffusion")
+_TRUTH_FORMS = ("spectral", "assignment")
+
+
+@dataclass(frozen=True)
+class NetOptions:
+    """Everything that :class:`torchqm.learn.net.MatchNet` is made from.
+
+    Args:
+        setup: ``functional_map``, ``quotient`` or ``quotient+odd``.
+        supervision: ``none``; ``orbit``, the truth up to symmetry; or ``plain``, the truth taken literally, for
+            ``functional_map`` only.
+        truth_form: ``spectral`` (the functional map sends deltas to deltas) or ``assignment`` (the soft map has its
+            weight at the truth). Up to symmetry the spectral one needs an even block.
+        inputs: names of :class:`torchqm.nn.InputFeatures`.
+        signature: energies of a wave kernel signature, times of a heat kernel signature.
+        k: eigenfunctions of the bases that will be given.
+        network: ``mlp`` or ``diffusion``.
+        channels: of the features.
+        width: channels inside the network.
+        blocks: of ``diffusion``; hidden layers of ``mlp``.
+        dropout: probability.
+        gradients: ``diffusion``: use products of gradients.
+        rotations: ``diffusion``: let them see the orientation. Then features differ left and right, and those of
+            ``quotient+odd`` are no longer even.
+        odd_pairs: odd descriptors, at most.
+        lmbda: weight of commutativity in the solver.
+        tau: temperature of the soft point maps.
+        w_bij: weight of bijectivity in the loss.
+        w_orth: of orthogonality.
+        w_lap: of commutativity.
+        w_align: of the agreement of soft and functional maps.
+        w_truth: of the supervision.
+
+    Raises:
+        ValueError: an unknown word, a number out of range, or a supervision that the set-up does not have.
+
+    Example:
+        >>> NetOptions(setup="quotient", supervision="orbit").truth_form
+        'spectral'
+    """
+
+    setup: str = "quotient+odd"
+    supervision: str = "none"
+    truth_form: str = "spectral"
+    inputs: Sequence[str] = ("wks",)
+    signature: int = 64
+    k: int = 60
+    network: str = "mlp"
+    channels: int = 64
+    width: int = 128
+    blocks: int = 2
+    dropout: float = 0.0
+    gradients: bool = True
+    rotations: bool = False
+    odd_pairs: int = 64
+    lmbda: float = 100.0
+    tau: float = 0.07
+    w_bij: float = 1.0
+    w_orth: float = 1.0
+    w_lap: float = 1e-3
+    w_align: float = 1.0
+    w_truth: float = 1.0
+
+    def __post_init__(self) -> None:
+        words = {"setup": SETUPS, "supervision": SUPERVISIONS, "truth_form": _TRUTH_FORMS, "network": NETWORKS}
+        for name, allowed in words.items():
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name}: {getattr(self, name)!r} given, allowed are {', '.join(allowed)}")
+        for name in ("signature", "k", "width", "blocks", "odd_pairs"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: {getattr(self, name)} given, expected at least 1")
+        if self.channels < 2:
+            raise ValueError(f"channels: {self.channels} given, expected at least 2")
+        if not self.tau > 0:
+            raise ValueError(f"tau: {self.tau} given, expected a positive number")
+        for name in ("lmbda", "w_align", "w_truth"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise ValueError(f"{name}: {getattr(self, name)} given, expected a number from 0 on")
+        if self.supervision == "plain" and self.setup != "functional_map":
+            raise ValueError(f"supervision: 'plain' given for {self.setup}; it has 'orbit' and 'none'")
+        if self.supervision == "orbit" and self.setup == "functional_map" and self.truth_form == "spectral":
+            raise ValueError("truth_form: 'spectral' up to symmetry needs an even block; here there is 'assignment'")
+        if self.supervision == "none" and not any((self.w_bij, self.w_orth, self.w_lap, self.w_align)):
+            raise ValueError("supervision: 'none' with all weights 0 leaves no loss")
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The keys of :class:`torchqm.data.ItemOptions` that the network reads, but for ``corr``."""
+        extra = ("gradients",) if self.network == "diffusion" and self.gradients else ()
+        return ("mass", "basis", "group", *extra)
