@@ -17,6 +17,9 @@ jaxtyping.jaxtyped = importlib.import_module("references.checker").jaxtyped
 jaxtyping.install_import_hook("torchqm", "references.checker.checked")
 
 
+collect_ignore = ["references/compiled"]  # scripts for processes without the checks above
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection(session):
     """What takes seconds to import is not needed where tests are only given out to other processes."""

@@ -46,7 +46,7 @@ class Ours:
     Example:
         >>> from torchqm.data.synthetic import creature
         >>> from torchqm.matching import MatchParameters, prepare
-        >>> x = prepare(creature("ellipsoid", 500).mesh, k=40)
+        >>> x = prepare(creature("quadruped", 500).mesh, k=40)
         >>> Ours("paper", parameters=MatchParameters(k=20, k_max=40)).match(x, x).labels
         ('direct', 'mirrored')
     """
