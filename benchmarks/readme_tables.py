@@ -307,6 +307,12 @@ def main() -> int:
             found[0]["creatures"] = {k: v for data in found for k, v in data["creatures"].items()}
         if found:
             parts.append(make(found[0]))
+    if (RESULTS / "evaluate_speed.json").exists():
+        speed_of = json.loads((RESULTS / "evaluate_speed.json").read_text())
+        parts.append(
+            f"Evaluation, `{speed_of['command']}`: {speed_of['shapes']} shapes ({speed_of['vertices']:,} vertices in all) read with their "
+            f"eigenfunctions from the cache and a map to each measured, {speed_of['seconds']:.0f} s with {speed_of['jobs']} processes."
+        )
     if (RESULTS / "layers.json").exists():
         parts.append(layers(json.loads((RESULTS / "layers.json").read_text())))
     if (RESULTS / "comparison").exists():
