@@ -16,6 +16,7 @@ __all__ = [
     "disabled",
     "enabled",
     "require_finite",
+    "require_ids",
     "require_mask",
     "require_nonnegative",
     "set_enabled",
@@ -166,6 +167,19 @@ def require_nonnegative(name: str, tensor: Tensor) -> None:
         raise ValueError(
             f"{name}: {int(bad.sum())} of {bad.numel()} entries are negative, the first at {first} is "
             f"{float(tensor[first]):.3g}; only zero and more are allowed"
+        )
+
+
+def require_ids(name: str, ids: Tensor, n: int, none: bool = False) -> None:
+    """Raise ``ValueError`` where an id lies outside ``0..n-1``; with ``none``, -1 is allowed, too."""
+    if ids.dtype != torch.int64:
+        raise ValueError(f"{name}: dtype {ids.dtype} given, expected vertex ids (torch.int64)")
+    if not enabled() or not ids.numel():
+        return
+    least, most = (int(v) for v in torch.aminmax(ids))
+    if least < (-1 if none else 0) or most >= n:
+        raise ValueError(
+            f"{name}: ids from {least} to {most} given, allowed are 0..{n - 1}{' and -1 (none)' if none else ''}"
         )
 
 

@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchqm.checks import Sizes, enabled, require_finite, require_mask, require_nonnegative
+from torchqm.checks import Sizes, enabled, require_finite, require_ids, require_mask, require_nonnegative
 from torchqm.fmap.orbit_terms import rows_at
 from torchqm.fmap.orbit_truth import soft_minimum
-from torchqm.fmap.tables import check_group, require_ids, require_weights
+from torchqm.fmap.tables import check_group, require_weights
 from torchqm.spectral.soft_map import SoftMap
 from torchqm.symmetry.algebra import inverses
 

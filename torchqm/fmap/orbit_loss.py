@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchqm.checks import Sizes, require_finite
+from torchqm.checks import Sizes, require_finite, require_ids
 from torchqm.fmap.orbit_terms import (
     Soft,
     bind_distances,
@@ -24,7 +24,7 @@ from torchqm.fmap.orbit_terms import (
     values_of,
 )
 from torchqm.fmap.orbit_truth import images_of, orbit_members, soft_minimum
-from torchqm.fmap.tables import check_group, require_ids, require_weights
+from torchqm.fmap.tables import check_group, require_weights
 from torchqm.spectral.soft_map import SoftMap
 
 __all__ = ["assignment_orbit_loss", "distance_orbit_loss", "map_orbit_loss", "spectral_orbit_loss"]

@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchqm.checks import Sizes
+from torchqm.checks import Sizes, require_ids
 from torchqm.fmap.orbit_truth import point_weights
-from torchqm.fmap.tables import require_ids, require_weights
+from torchqm.fmap.tables import require_weights
 from torchqm.spectral.soft_map import SoftMap
 
 __all__ = [

@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchqm.checks import enabled, require_nonnegative
-from torchqm.fmap.tables import check_group, require_ids
+from torchqm.checks import enabled, require_ids, require_nonnegative
+from torchqm.fmap.tables import check_group
 
 __all__ = ["images_of", "orbit_members", "point_weights", "soft_minimum"]
 

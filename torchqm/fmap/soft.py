@@ -4,9 +4,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchqm.checks import Sizes, enabled, require_finite, require_mask
+from torchqm.checks import Sizes, enabled, require_finite, require_ids, require_mask
 from torchqm.fmap.pair_products import PairProducts, at_neighbours, by_blocks, rows_at_once
-from torchqm.fmap.tables import require_ids
 from torchqm.spectral.soft_map import SoftMap
 
 __all__ = ["feature_neighbours", "soft_assignment", "soft_map"]

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchqm.checks import Sizes
+from torchqm.checks import Sizes, require_ids
 from torchqm.fmap.orbit_truth import images_of
-from torchqm.fmap.tables import check_group, require_ids
+from torchqm.fmap.tables import check_group
 
 __all__ = ["error_means", "straight_errors"]
 

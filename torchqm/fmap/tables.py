@@ -1,11 +1,11 @@
-"""Checks of tables of vertex ids and of large tensors of weights; they say what is allowed."""
+"""Checks of tables of vertex maps and of large tensors of weights; they say what is allowed."""
 
 import torch
 from torch import Tensor
 
-from torchqm.checks import Sizes, enabled, require_finite, require_mask, require_nonnegative
+from torchqm.checks import Sizes, enabled, require_finite, require_ids, require_mask, require_nonnegative
 
-__all__ = ["check_group", "require_ids", "require_weights"]
+__all__ = ["check_group", "require_weights"]
 
 
 def check_group(name: str, group: Tensor, mask: Tensor | None, mask_name: str = "group_mask") -> None:
@@ -26,19 +26,6 @@ def check_group(name: str, group: Tensor, mask: Tensor | None, mask_name: str = 
         raise ValueError(f"{name}: row 0 must be the identity; the table is (..., G, V), one row an element")
     if mask is not None and not bool(mask[..., 0].all()):
         raise ValueError(f"{mask_name}: element 0, the identity, is real in each shape")
-
-
-def require_ids(name: str, ids: Tensor, n: int, none: bool = False) -> None:
-    """Raise ``ValueError`` where an id lies outside ``0..n-1``; with ``none``, -1 is allowed, too."""
-    if ids.dtype != torch.int64:
-        raise ValueError(f"{name}: dtype {ids.dtype} given, expected vertex ids (torch.int64)")
-    if not enabled() or not ids.numel():
-        return
-    least, most = (int(v) for v in torch.aminmax(ids))
-    if least < (-1 if none else 0) or most >= n:
-        raise ValueError(
-            f"{name}: ids from {least} to {most} given, allowed are 0..{n - 1}{' and -1 (none)' if none else ''}"
-        )
 
 
 def require_weights(name: str, values: Tensor, logarithms: bool = False) -> None:

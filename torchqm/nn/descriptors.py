@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torchqm.checks import Sizes, require_finite, require_mask, require_nonnegative
-from torchqm.fmap.tables import require_ids
+from torchqm.checks import Sizes, require_finite, require_ids, require_mask, require_nonnegative
 from torchqm.spectral.descriptors import WaveEnergies, heat_kernel_values, wave_kernel_values
 from torchqm.symmetry.orientation import function_pairs, orientation_descriptors
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchqm.checks import Sizes, enabled, require_finite, require_mask, require_nonnegative
+from torchqm.checks import Sizes, enabled, require_finite, require_ids, require_mask, require_nonnegative
 from torchqm.spectral.soft_map import SoftMap
 
 __all__ = ["projection_matrices"]
@@ -136,8 +136,10 @@ def check_symmetry(
         raise ValueError(f"the symmetry is given by {names or 'nothing'}: exactly one of {', '.join(given)} is allowed")
     if group is not None:
         sizes.bind("group", group, "... G V", any_dtype=True)
-        _check_ids("group", group, sizes["V"], verts_mask)
+        require_ids("group", group, sizes["V"])
         if enabled():
+            if verts_mask is not None:
+                _stays_real("group", group, verts_mask)
             own = torch.arange(sizes["V"], device=group.device)
             moved = group[..., 0, :] != own
             if bool((moved if verts_mask is None else moved & verts_mask).any()):
@@ -153,7 +155,7 @@ def check_symmetry(
             raise ValueError(
                 f"soft_map: goes to {soft_map.n_targets} vertices, but the shape has {sizes['V']}; a self-map is needed"
             )
-        _check_ids("soft_map.indices", soft_map.indices, sizes["V"], None)
+        require_ids("soft_map.indices", soft_map.indices, sizes["V"])
         require_finite("soft_map.weights", soft_map.weights)
     elif soft_map is not None:
         sizes.bind("soft_map", soft_map, "... V V")
@@ -167,20 +169,13 @@ def check_symmetry(
             raise ValueError("group_mask: element 0, the identity, must be real (true) in each sample")
 
 
-def _check_ids(name: str, ids: Tensor, n: int, verts_mask: Tensor | None) -> None:
-    if ids.dtype.is_floating_point or ids.dtype == torch.bool:
-        raise ValueError(f"{name}: dtype {ids.dtype} given, expected integer vertex ids")
-    if not enabled() or not ids.numel():
-        return
-    low, high = int(ids.min()), int(ids.max())
-    if low < 0 or high >= n:
-        raise ValueError(f"{name}: vertex ids {low}..{high} given, allowed are 0..{n - 1}")
-    if verts_mask is not None:
-        mask = verts_mask[..., None, :].expand(ids.shape)
-        lost = mask & ~torch.gather(mask, -1, ids.long())
-        if bool(lost.any()):
-            first = tuple(int(i) for i in lost.nonzero()[0])
-            raise ValueError(f"{name}: a real vertex goes to a padded one, the first at {first}")
+def _stays_real(name: str, ids: Tensor, verts_mask: Tensor) -> None:
+    """Raise where a real vertex goes to a padded one."""
+    mask = verts_mask[..., None, :].expand(ids.shape)
+    lost = mask & ~torch.gather(mask, -1, ids)
+    if bool(lost.any()):
+        first = tuple(int(i) for i in lost.nonzero()[0])
+        raise ValueError(f"{name}: a real vertex goes to a padded one, the first at {first}")
 
 
 def _shares(mask: Tensor | None, fmaps: Tensor) -> Tensor:
