@@ -19,7 +19,7 @@ for path in sys.argv[1:]:
     try:
         runpy.run_path(path)
         print("succeeded")
-    except BaseException:
+    except (Exception, SystemExit):
         print(traceback.format_exc())
 """
 
