@@ -32,7 +32,7 @@ FIRST, SECOND, CHOICE = 40, 60, 100
 
 CLOSE = 1.1
 """Maps with up to this multiple of the best score are ranked by how they change distances, too. At 1.35 a wrong map
-took the place of a better one on two of TOSCA's poses; at 1.1 one cat is worse, and 20 bipeds are the same with both."""
+took the place of a better one on two of TOSCA's poses; at 1.1 one cat is worse, and 20 bipeds are as before."""
 
 FEW = 40
 """Proposals from landmarks below which signs of eigenfunctions are tried, too: an egg has two tips."""
