@@ -1,5 +1,7 @@
 """torchqm.spectral.eigen: exact spectra, the dense twin, what happens to odd input."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.sparse.linalg as spla
@@ -8,8 +10,17 @@ from references.dense import dense_eigenpairs
 from references.shapes import basis_of, blob, grid, icosphere, neumann_spectrum, rotation
 
 from torchqm.geometry import Laplacian, Mesh, laplacian
-from torchqm.spectral import SpectralBasis, SpectrumError, cluster_end, eigenbasis, fix_signs, mesh_basis
+from torchqm.spectral import (
+    SpectralBasis,
+    SpectrumError,
+    SpectrumWarning,
+    cluster_end,
+    eigenbasis,
+    fix_signs,
+    mesh_basis,
+)
 from torchqm.spectral import relative_residuals as residuals
+from torchqm.spectral.lanczos import LanczosError, lowest_eigenpairs
 from torchqm.testing import basis_allclose
 
 
@@ -48,9 +59,10 @@ def test_neumann_spectrum_of_a_rectangle_converges():
 
 
 @pytest.mark.parametrize("mesh", [blob(1).mesh, icosphere(3), grid(24, 16, 1.5, 1.0)], ids=lambda m: m.name)
-def test_agrees_with_the_dense_solver(mesh):
+@pytest.mark.parametrize("solver", ["lanczos", "arpack", "dense"])
+def test_agrees_with_the_dense_solver(mesh, solver):
     operator = laplacian(mesh)
-    fast = eigenbasis(operator, 30)
+    fast = eigenbasis(operator, 30, tol=1e-10, solver=solver)
     evals, evecs = dense_eigenpairs(operator, 30)
     torch.testing.assert_close(fast.evals, evals, atol=1e-10, rtol=1e-10)
     k = cluster_end(evals, 28)  # the sphere's last cluster may be cut
@@ -127,7 +139,40 @@ def test_no_convergence_is_reported_with_numbers(monkeypatch, mirror_blob):
 
     monkeypatch.setattr(spla, "eigsh", fail)
     with pytest.raises(SpectrumError, match="blob2: ARPACK found 3 of 12 eigenpairs"):
-        mesh_basis(mirror_blob.mesh, 12)
+        eigenbasis(laplacian(mirror_blob.mesh), 12, "blob2", solver="arpack")
+
+
+def test_where_block_lanczos_fails_arpack_is_asked_and_that_is_said(monkeypatch, mirror_blob):
+    def fail(*args, **options):
+        raise LanczosError("block Lanczos: 3 of 12 pairs within 1e-08 from 96 vectors")
+
+    expected = mesh_basis(mirror_blob.mesh, 12)
+    monkeypatch.setattr("torchqm.spectral.eigen.lowest_eigenpairs", fail)
+    with pytest.warns(SpectrumWarning, match="blob2: block Lanczos: 3 of 12 pairs .* ARPACK is asked"):
+        found = mesh_basis(mirror_blob.mesh, 12)
+    torch.testing.assert_close(found.evals, expected.evals, rtol=1e-10, atol=1e-10)
+    with pytest.raises(SpectrumError, match="blob2: block Lanczos: 3 of 12"):
+        eigenbasis(laplacian(mirror_blob.mesh), 12, "blob2", solver="lanczos")
+
+
+def test_residuals_of_what_was_computed_are_checked(monkeypatch, mirror_blob):
+    exact = lowest_eigenpairs
+
+    def careless(*args, **options):
+        pairs = exact(*args, **options)
+        return replace(pairs, residuals=np.where(np.arange(12) == 7, 2e-7, pairs.residuals))
+
+    monkeypatch.setattr("torchqm.spectral.eigen.lowest_eigenpairs", careless)
+    with pytest.raises(SpectrumError, match=r"pair 7 of 12 has a residual of 2e-07, not 1e-08"):
+        eigenbasis(laplacian(mirror_blob.mesh), 12, "blob2", solver="lanczos")
+
+
+@pytest.mark.parametrize(
+    ("options", "text"), [({"solver": "qr"}, "'qr' given, allowed are auto"), ({"tol": 0.1}, "0.1")]
+)
+def test_wrong_options(mirror_blob, options, text):
+    with pytest.raises(ValueError, match=text):
+        eigenbasis(laplacian(mirror_blob.mesh), 12, **options)
 
 
 def test_residuals_see_a_wrong_pair(mirror_blob):

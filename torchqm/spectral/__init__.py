@@ -20,7 +20,7 @@ from torchqm.spectral.descriptors import (
     wave_kernel_signature,
     wave_kernel_values,
 )
-from torchqm.spectral.eigen import SpectrumError, eigenbasis, fix_signs, mesh_basis, relative_residuals
+from torchqm.spectral.eigen import SpectrumError, SpectrumWarning, eigenbasis, fix_signs, mesh_basis, relative_residuals
 from torchqm.spectral.features import local_features, smooth_curvature
 from torchqm.spectral.soft_map import SoftMap, soft_fmap
 
@@ -31,6 +31,7 @@ __all__ = [
     "SoftMap",
     "SpectralBasis",
     "SpectrumError",
+    "SpectrumWarning",
     "WaveEnergies",
     "cache_folder",
     "cached_basis",

@@ -1,6 +1,9 @@
 """The first eigenpairs of a shape's Laplacian."""
 
+import warnings
+
 import numpy as np
+import scipy.linalg as sl
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 import torch
@@ -11,14 +14,34 @@ from torch import Tensor
 from torchqm.geometry.laplacian import Laplacian, laplacian, to_scipy
 from torchqm.geometry.mesh import Mesh
 from torchqm.spectral.basis import SpectralBasis
+from torchqm.spectral.lanczos import BLOCK, LanczosError, lowest_eigenpairs
 
-__all__ = ["SpectrumError", "eigenbasis", "fix_signs", "mesh_basis", "relative_residuals"]
+__all__ = [
+    "SOLVERS",
+    "TOLERANCE",
+    "SpectrumError",
+    "SpectrumWarning",
+    "eigenbasis",
+    "fix_signs",
+    "mesh_basis",
+    "relative_residuals",
+]
 
-SHIFT = -1e-2  # in units of 1/area: below the spectrum, so that W - shift M can be factored
+SOLVERS = ("auto", "dense", "lanczos", "arpack")
+
+TOLERANCE = 1e-8
+"""Default bound of the relative residuals. Each digit costs about 5 % more time, see benchmarks/speed.py."""
+
+SHIFT = -1e-2  # of ARPACK, in units of 1/area: below the spectrum, so that W - shift M can be factored
+_DENSE_SIZE = 400
 
 
 class SpectrumError(ValueError):
     """The eigenpairs that were asked for cannot be had from this operator."""
+
+
+class SpectrumWarning(UserWarning):
+    """The eigenpairs came from the slower solver; the message says why."""
 
 
 def fix_signs(evecs: Float[Tensor, "V K"]) -> Float[Tensor, "V K"]:
@@ -37,27 +60,40 @@ def fix_signs(evecs: Float[Tensor, "V K"]) -> Float[Tensor, "V K"]:
     return evecs * torch.where(sign == 0, 1.0, sign)
 
 
-def eigenbasis(operator: Laplacian, k: int, name: str = "mesh") -> SpectralBasis:
-    """The ``k`` lowest eigenpairs of ``W phi = lambda M phi`` by shift-invert Lanczos (ARPACK, sparse factorisation).
+def eigenbasis(
+    operator: Laplacian, k: int, name: str = "mesh", *, tol: float = TOLERANCE, solver: str = "auto"
+) -> SpectralBasis:
+    """The ``k`` lowest eigenpairs of ``W phi = lambda M phi``, as exact as ``tol`` says.
 
-    Vertices without mass (no face uses them) take no part; their entries in ``evecs`` are zero. Below 200 vertices,
-    or with at most 12 more than ``k``, the dense solver is used. The start vector is fixed, so equal input gives
-    equal output.
+    The rule of ``solver="auto"``: up to 400 vertices, or three times ``k``, the matrix is diagonalised as a dense one;
+    else block Lanczos (:func:`torchqm.spectral.lanczos.lowest_eigenpairs`); and where that does not reach ``tol``,
+    ARPACK with a :class:`SpectrumWarning` that gives its numbers. Vertices without mass (no face uses them) take no
+    part; their entries in ``evecs`` are zero. Start vectors are fixed, so equal input gives equal output.
 
     Args:
         operator: stiffness ``(V, V)`` and lumped mass ``(V,)``.
         k: number of eigenpairs, the constant function included.
         name: what error messages call the shape.
+        tol: bound of :func:`relative_residuals`; where ``eps |W| / lambda`` is larger, rounding forbids less than that.
+        solver: ``auto``, ``dense``, ``lanczos`` or ``arpack`` (each alone: an error where it fails).
 
     Returns:
         The basis, eigenvalues ascending, signs by :func:`fix_signs`.
 
     Raises:
-        SpectrumError: fewer vertices than ``k``, or ARPACK does not converge (with its numbers).
+        SpectrumError: fewer vertices than ``k``, or no convergence (with its numbers).
+        ValueError: an unknown ``solver``, or ``tol`` not in ``(0, 1e-3]``.
+
+    Warns:
+        SpectrumWarning: block Lanczos did not reach ``tol``; ARPACK was asked.
 
     References:
         Paper, section 3 (the multiscale basis); Levy and Zhang 2010 for shift-invert.
     """
+    if solver not in SOLVERS:
+        raise ValueError(f"solver: {solver!r} given, allowed are {', '.join(SOLVERS)}")
+    if not 0 < tol <= 1e-3:
+        raise ValueError(f"tol: {tol} given, allowed is more than 0 and at most 1e-3")
     mass = operator.mass.numpy().astype(np.float64)
     used = np.flatnonzero(mass > 0)
     if k < 1 or k > used.size:
@@ -65,26 +101,52 @@ def eigenbasis(operator: Laplacian, k: int, name: str = "mesh") -> SpectralBasis
             f"{name}: {k} eigenpairs asked for, but the mesh has {used.size} vertices with area; "
             f"allowed are 1..{used.size}"
         )
-    # Work at unit area: the shift and ARPACK's tolerances then mean the same for a fly and for a whale.
+    # Work at unit area: shifts and tolerances then mean the same for a fly and for a whale.
     area = mass.sum()
     root = np.sqrt(mass[used] / area)
-    stiffness = to_scipy(operator.stiffness).tocsr()[used][:, used]
+    stiffness = to_scipy(operator.stiffness).tocsr()
+    if used.size < mass.size:
+        stiffness = stiffness[used][:, used]
     scale = sp.diags_array(1 / root)
     matrix = (scale @ stiffness @ scale).tocsc()
-    matrix = (matrix + matrix.T) / 2
-    if used.size <= k + 12 or used.size < 200:
-        evals, vectors = np.linalg.eigh(matrix.toarray())
-        evals, vectors = evals[:k], vectors[:, :k]
-    else:
-        evals, vectors = _shift_invert(matrix.tocsc(), k, name)
+    evals, rows = _solve(((matrix + matrix.T) / 2).tocsc(), k, tol, solver, name)
+    evecs = torch.zeros(mass.size, k, dtype=torch.float64)
+    evecs[torch.from_numpy(used)] = (rows / torch.from_numpy(root * np.sqrt(area))).T
+    return SpectralBasis(torch.from_numpy(np.maximum(evals, 0.0) / area), fix_signs(evecs), operator.mass)
+
+
+def _solve(matrix: sp.csc_array, k: int, tol: float, solver: str, name: str) -> tuple[np.ndarray, Tensor]:
+    """Eigenvalues ``(k,)`` ascending and eigenvectors as rows ``(k, n)``."""
+    n = matrix.shape[0]
+    if solver == "dense" or (solver == "auto" and n <= max(_DENSE_SIZE, 3 * k)) or k > n - 2 * BLOCK:
+        evals, vectors = sl.eigh(matrix.toarray(), subset_by_index=[0, k - 1])
+        return evals, torch.from_numpy(np.ascontiguousarray(vectors.T))
+    if solver != "arpack":
+        try:
+            # Weyl: the k-th eigenvalue of a surface of area 1 is about 4 pi k.
+            pairs = lowest_eigenpairs(matrix, k, tol, 4 * np.pi * k)
+            _require_residuals(matrix, pairs.residuals, pairs.evals, tol)
+            return pairs.evals, pairs.evecs
+        except LanczosError as error:
+            if solver == "lanczos":
+                raise SpectrumError(f"{name}: {error}") from error
+            warnings.warn(f"{name}: {error}; ARPACK is asked, which is slower", SpectrumWarning, stacklevel=3)
+    evals, vectors = _shift_invert(matrix, k, name)
     order = np.argsort(evals, kind="stable")
-    full = np.zeros((mass.size, k))
-    full[used] = vectors[:, order] / root[:, None] / np.sqrt(area)
-    evecs = fix_signs(torch.from_numpy(full))
-    return SpectralBasis(torch.from_numpy(np.maximum(evals[order], 0.0) / area), evecs, operator.mass)
+    return evals[order], torch.from_numpy(np.ascontiguousarray(vectors[:, order].T))
+
+
+def _require_residuals(matrix: sp.csc_array, residuals: np.ndarray, evals: np.ndarray, tol: float) -> None:
+    # The product A x alone is wrong by eps |A|; the lowest eigenvalues feel it most.
+    rounding = np.finfo(np.float64).eps * abs(matrix).sum(0).max() / np.maximum(evals, np.median(evals) / len(evals))
+    allowed = np.maximum(tol, 10 * rounding)
+    worst = int(np.argmax(residuals / allowed))
+    if residuals[worst] > allowed[worst]:
+        raise LanczosError(f"pair {worst} of {len(residuals)} has a residual of {residuals[worst]:.2g}, not {tol:g}")
 
 
 def _shift_invert(matrix: sp.csc_array, k: int, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Shift-invert Lanczos (ARPACK, sparse factorisation): the slow way, one vector at a time."""
     n = matrix.shape[0]
     # SymmetricMode with minimum degree on A + A^T keeps the fill of a Cholesky factor; the default ordering doubles it.
     factor = spla.splu(

@@ -1,0 +1,96 @@
+"""torchqm.spectral.lanczos: complete multiplicities, wrong guesses, what happens when it cannot work."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import torch
+from references.shapes import icosphere
+
+from torchqm.geometry import Mesh, laplacian, to_scipy
+from torchqm.spectral.lanczos import LanczosError, lowest_eigenpairs
+
+
+def scaled(mesh: Mesh) -> sp.csc_array:
+    """``M^-1/2 W M^-1/2`` at unit area."""
+    operator = laplacian(mesh)
+    mass = operator.mass.numpy()
+    root = sp.diags_array(np.sqrt(mass.sum() / mass))
+    return sp.csc_array(root @ to_scipy(operator.stiffness) @ root)
+
+
+def copies(mesh: Mesh, count: int) -> Mesh:
+    verts = torch.cat([mesh.verts + 10.0 * i for i in range(count)])
+    return Mesh(verts, torch.cat([mesh.faces + i * mesh.n_verts for i in range(count)]))
+
+
+def cube(n: int) -> sp.csc_array:
+    """The finite-difference Laplacian of a flat 3-torus with ``n^3`` points: eigenvalues known, often 24 equal ones."""
+    ring = sp.csc_array(2 * np.eye(n) - np.roll(np.eye(n), 1, 0) - np.roll(np.eye(n), -1, 0))
+    eye = sp.eye_array(n)
+    return sp.csc_array(
+        sp.kron(sp.kron(ring, eye), eye) + sp.kron(sp.kron(eye, ring), eye) + sp.kron(eye, sp.kron(eye, ring))
+    )
+
+
+def torus_spectrum(n: int, k: int) -> np.ndarray:
+    ring = 2 - 2 * np.cos(2 * np.pi * np.arange(n) / n)
+    return np.sort((ring[:, None, None] + ring[:, None] + ring).ravel())[:k]
+
+
+@pytest.mark.parametrize(("factor", "k"), [(1.0, 40), (0.2, 40), (8.0, 40), (1.0, 7), (1.0, 150)])
+def test_agrees_with_the_dense_solver_whatever_the_guess(mirror_blob, factor, k):
+    matrix = scaled(mirror_blob.mesh)
+    evals, evecs = np.linalg.eigh(matrix.toarray())
+    pairs = lowest_eigenpairs(matrix, k, 1e-10, factor * float(evals[k]))
+    np.testing.assert_allclose(pairs.evals[1:], evals[1:k], rtol=1e-11)
+    assert abs(pairs.evals[0]) < 1e-9
+    overlap = pairs.evecs.numpy() @ evecs[:, :k]
+    np.testing.assert_allclose(np.abs(np.linalg.det(overlap)), 1, atol=1e-7)  # the same space
+    np.testing.assert_allclose((pairs.evecs @ pairs.evecs.T).numpy(), np.eye(k), atol=1e-10)
+    assert pairs.residuals.max() < 1e-10 + 1e-12 * evals[-1] / evals[1]
+    assert (pairs.attempts > 1) == (factor == 0.2)  # the filter began below the last eigenvalue wanted
+
+
+def test_residuals_are_those_of_the_matrix(mirror_blob):
+    matrix = scaled(mirror_blob.mesh)
+    pairs = lowest_eigenpairs(matrix, 20, 1e-4, 4 * np.pi * 20)
+    rows = pairs.evecs.numpy()
+    applied = rows @ matrix.toarray() - pairs.evals[:, None] * rows
+    expected = np.linalg.norm(applied, axis=1) / np.maximum(pairs.evals, pairs.evals[1])
+    np.testing.assert_allclose(pairs.residuals, expected, rtol=1e-3, atol=1e-13)
+    assert 1e-12 < expected.max() <= 1e-4
+
+
+def test_clusters_wider_than_a_block_are_complete():
+    found = lowest_eigenpairs(cube(12), 81, 1e-9, float(torus_spectrum(12, 81)[-1]))
+    np.testing.assert_allclose(found.evals, torus_spectrum(12, 81), atol=1e-9)
+    assert found.attempts > 1  # up to 24 equal eigenvalues do not come out of blocks of 16
+    assert np.diff(found.evals).max() > 0.1
+
+
+def test_every_component_has_its_constant():
+    pairs = lowest_eigenpairs(scaled(copies(icosphere(2), 6)), 40, 1e-9, 4 * np.pi * 40)
+    single = np.linalg.eigvalsh(scaled(icosphere(2)).toarray())[:8]
+    np.testing.assert_allclose(pairs.evals, 6 * np.repeat(single, 6)[:40], atol=1e-6 * pairs.evals[-1])
+
+
+def test_equal_input_equal_output(mirror_blob):
+    matrix = scaled(mirror_blob.mesh)
+    first, again = (lowest_eigenpairs(matrix, 20, 1e-8, 250.0) for _ in range(2))
+    assert torch.equal(first.evecs, again.evecs)
+
+
+def test_more_copies_than_four_blocks_have_is_an_error():
+    with pytest.raises(LanczosError, match=r"\d+ equal eigenvalues in blocks of (16|32|64)"):
+        lowest_eigenpairs(sp.csc_array(sp.diags_array(np.repeat(np.arange(1.0, 11), 100))), 100, 1e-8, 2.0)
+
+
+def test_no_convergence_says_how_far_it_came(mirror_blob):
+    with pytest.raises(LanczosError, match=r"block Lanczos: \d+ of 400 pairs within 1e-08 from \d+ vectors"):
+        lowest_eigenpairs(scaled(mirror_blob.mesh), 400, 1e-8, 1e-3)
+
+
+def test_a_matrix_without_factor_is_an_error():
+    matrix = sp.csc_array(sp.diags_array(np.r_[-5.0, np.arange(1.0, 500)]))
+    with pytest.raises(LanczosError, match="no Cholesky factor"):
+        lowest_eigenpairs(matrix, 10, 1e-8, 10.0)
