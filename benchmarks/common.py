@@ -2,11 +2,13 @@
 
 import hashlib
 import json
+import multiprocessing
 import os
 import platform
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -51,6 +53,25 @@ def write_json(path: Path, result: Mapping[str, Any]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, lambda file: file.write((_one_line_lists(text) + "\n").encode()))
     return path
+
+
+def peak_mib(call: Callable[..., Any], *args: Any) -> float:
+    """Memory that a call takes at its peak, beyond what its process held before, in MiB; in a process of its own."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(_peak, call, args, torch.get_num_threads()).result()
+
+
+def _peak(call: Callable[..., Any], args: tuple[Any, ...], threads: int) -> float:
+    torch.set_num_threads(threads)
+    before = _status("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here (Linux)
+    call(*args)
+    return (_status("VmHWM") - before) / 1024
+
+
+def _status(name: str) -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line.split()[1] for line in lines if line.startswith(f"{name}:")))
 
 
 def cached_basis(mesh: Mesh, k: int, folder: Path | None = None) -> SpectralBasis:

@@ -157,9 +157,24 @@ class _Run:
     def _converged(self, rest: np.ndarray, begin: int) -> bool:
         theta, ritz = np.linalg.eigh(self.projected[: self.size, : self.size])
         self.theta, self.ritz = theta[::-1][: self.k], ritz[:, ::-1][:, : self.k]
-        left = np.linalg.norm(rest @ self.ritz[begin:], axis=0)
-        self.done = int((left <= self.tol * self.theta).sum()) if self.size >= self.k else 0
+        self.done = int((self._bounds(rest @ self.ritz[begin:]) <= self.tol).sum())
         return self.done == self.k
+
+    def _bounds(self, rest: np.ndarray) -> np.ndarray:
+        """Bounds of the residuals that :meth:`pairs` will have; infinite where the filter lets nothing through.
+
+        With ``r = ((B - a)^2 - theta) x`` and ``nu = a + sqrt(theta)``, ``(B - nu) x = (B - a + sqrt(theta))^-1 r``,
+        where no eigenvalue of the bracket is below ``sqrt(theta) - a``. One more solve, ``x' = B x / nu``, makes of it
+        ``A x' - lambda x' = -nu^-2 (B - nu) x``.
+        """
+        root = np.sqrt(np.maximum(self.theta, 0))
+        open_, shifted = root > self.centre, 1 / (self.centre + root)
+        evals = shifted - self.shift
+        lowest = evals[evals > _ZERO * self.guess]
+        scale = np.maximum(evals, lowest[0] if lowest.size else self.guess)
+        gap = np.where(open_, root - self.centre, 1.0)
+        bounds = np.linalg.norm(rest, axis=0) * shifted**2 / (gap * scale)
+        return np.where(open_, bounds, np.inf)
 
     def _filtered(self, rows: Tensor) -> Tensor:
         for _ in range(2):
