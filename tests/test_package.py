@@ -1,3 +1,5 @@
+import importlib
+import pkgutil
 import subprocess
 import sys
 import tomllib
@@ -26,6 +28,15 @@ def test_subpackages_are_loaded_on_first_use_and_name_what_they_have(name):
     assert module.__name__ == f"torchqm.{name}"
     assert [n for n in module.__all__ if not hasattr(module, n)] == []
     assert sorted(module.__all__) == sorted(set(module.__all__))
+
+
+PACKAGES = {found.name for found in pkgutil.walk_packages(torchqm.__path__, "torchqm.") if found.ispkg}
+
+
+@pytest.mark.parametrize("name", sorted(PACKAGES - {f"torchqm.{name}" for name in torchqm._SUBPACKAGES}))
+def test_other_packages_have_what_they_name(name):
+    module = importlib.import_module(name)
+    assert [n for n in getattr(module, "__all__", []) if not hasattr(module, n)] == []
 
 
 def test_unknown_name_is_an_attribute_error():

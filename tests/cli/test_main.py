@@ -1,5 +1,4 @@
 import re
-import subprocess
 import sys
 
 import pytest
@@ -93,20 +92,6 @@ def test_a_bug_keeps_its_traceback(monkeypatch):
     run_as(monkeypatch, ValueError("a bug"))
     with pytest.raises(ValueError, match="a bug"):
         main([])
-
-
-@pytest.mark.parametrize("words", [["-m", "torchqm", "--help"], ["-c", "import torchqm; dir(torchqm)"]])
-def test_help_and_import_load_nothing_heavy(words):
-    code = "import sys; sys.argv[0] = 'torchqm'; "
-    if words[0] == "-m":
-        code += (
-            "sys.argv.append('--help')\ntry:\n  from torchqm.cli.main import main; main()\nexcept SystemExit: pass\n"
-        )
-    else:
-        code += words[1] + "\n"
-    code += "print(sorted({n.split('.')[0] for n in sys.modules} & {'torch', 'numpy', 'scipy', 'matplotlib', 'gudhi'}))"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert run.stdout.splitlines()[-1] == "[]"
 
 
 @pytest.mark.parametrize(

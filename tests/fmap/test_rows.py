@@ -112,12 +112,12 @@ def test_the_factor_is_the_only_tensor_of_its_size(keep, monkeypatch):
     whole, gram = 8 * 2 * 60 * 40 * 40, a @ a.mT
     monkeypatch.setattr("torchqm.fmap.cholesky._AT_ONCE", {"cpu": 2 * 5 * 40 * 40})
     with Storages() as seen:
-        _, factor = module._solve_rows._init_fn(gram, d, r, 0, keep, True)
+        _, factor = module._solve_rows(gram, d, r, 0, keep, True)
     large = [size for size in seen.sizes.values() if size > whole / 10]
     assert large == ([whole] if keep else [])
     if keep:
         with Storages() as seen:
-            module._solve_rows_again._init_fn(r, factor)
+            module._solve_rows_again(r, factor)
         assert [size for size in seen.sizes.values() if size > whole / 10] == [whole]  # a view of the factor
 
 

@@ -1,8 +1,11 @@
 """What ``torchqm benchmark --help`` says."""
 
 import argparse
+import textwrap
 from collections.abc import Sequence
 from typing import Any
+
+from torchqm.catalogue import DESCRIPTIONS, PAIRS_HELP, PUBLISHED_METHODS
 
 __all__ = ["DESCRIPTION", "Help"]
 
@@ -48,19 +51,13 @@ exit status: 0 all pairs done, 1 some failed (the table says why), 2 wrong input
 
 
 class Help(argparse.Action):
-    """``--help`` with the names of all methods; they are in packages that load torch, so only then."""
+    """``--help`` with the names of all methods."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, **_: Any) -> None:
         super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help="show this help and exit")
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         """Print the help and stop."""
-        import textwrap
-
-        from torchqm.data.pairs import PAIRS_HELP
-        from torchqm.data.published import PUBLISHED_METHODS
-        from torchqm.matching.baselines import DESCRIPTIONS
-
         methods = "\n".join(f"  {name:24} {text}" for name, text in DESCRIPTIONS.items())
         pairs = "\n  ".join(textwrap.wrap(PAIRS_HELP, 88))
         parser.epilog = _EPILOG.format(methods=methods, published=", ".join(PUBLISHED_METHODS), pairs=pairs)

@@ -4,16 +4,11 @@ from difflib import get_close_matches
 from itertools import product
 from pathlib import Path
 
+from torchqm.catalogue import PAIRS_HELP
 from torchqm.data.base import ShapeSet
 from torchqm.data.files import read_pairs
 
 __all__ = ["PAIRS_HELP", "choose_pairs"]
-
-PAIRS_HELP = (
-    "all (ordered pairs), unordered, within-class, within-class+unordered, published (scb), or a file with two names a "
-    "line; '+self' adds each shape with itself"
-)
-"""What :func:`choose_pairs` understands, in a line for ``--help``."""
 
 _WORDS = ("all", "unordered", "within-class", "published", "scb", "self")
 

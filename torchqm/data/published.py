@@ -29,6 +29,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchqm.catalogue import PUBLISHED_METHODS
 from torchqm.evaluate.curves import cumulative_curve, curve_thresholds, mean_curve
 
 __all__ = [
@@ -45,15 +46,6 @@ __all__ = [
 ]
 
 RESULT_FOLDER = Path("Results") / "Results_Corr_TOSCA"
-PUBLISHED_METHODS = {
-    "BlendedMap": "Blended intrinsic maps (BIM)",
-    "LipmanGMDS": "Moebius voting",
-    "BestConf": "Best conformal map",
-    "BronsteinGMDS": "GMDS",
-    "Ovsjanikov1": "Heat kernel map, one correspondence (HKM)",
-    "Ovsjanikov2": "Heat kernel map, two correspondences (HKM-2)",
-}
-"""Method names in the file names, and what they stand for."""
 
 _FILE_NAME = re.compile(r"BenchResult_(?P<method>.+?)_(?P<source>[^_]+)_to_(?P<target>[^_]+)\.txt")
 

@@ -5,9 +5,9 @@ from functools import cache
 from types import ModuleType
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 __all__ = ["SurfaceSearch", "nearest_rows"]
@@ -99,8 +99,9 @@ class SurfaceSearch:
             n: anchors near a vertex whose partners are tried for it.
         """
         everything, chosen = verts.numpy(), verts[anchors].numpy()
-        around = cKDTree(everything).query(chosen, k=min(m, len(everything)), workers=torch.get_num_threads())[1]
-        close = cKDTree(chosen).query(everything, k=min(n, len(chosen)), workers=torch.get_num_threads())[1]
+        tree, workers = scipy.spatial.cKDTree, torch.get_num_threads()
+        around = tree(everything).query(chosen, k=min(m, len(everything)), workers=workers)[1]
+        close = tree(chosen).query(everything, k=min(n, len(chosen)), workers=workers)[1]
         return cls(
             anchors,
             torch.from_numpy(around.reshape(len(chosen), -1)),

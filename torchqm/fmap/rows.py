@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchqm.checks import Sizes, wanted
 from torchqm.fmap.cholesky import factorize, rows_at_once, solve_checked, solve_factored, surely_regular
+from torchqm.fmap.operator import operator
 
 __all__ = ["UndeterminedRowsError", "solve_rows"]
 
@@ -90,7 +91,7 @@ def solve_rows(
     return _Solve.apply(gram, diagonal, rhs, row_chunk or 0, keep, wanted())[0]
 
 
-@torch.library.custom_op("torchqm::solve_rows", mutates_args=())
+@operator("solve_rows")
 def _solve_rows(
     gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool, check: bool
 ) -> tuple[Tensor, Tensor]:
@@ -127,7 +128,7 @@ def _solve_rows(
     return rows.transpose(0, 1).reshape(rhs.shape).contiguous(), factor
 
 
-@torch.library.custom_op("torchqm::solve_rows_again", mutates_args=())
+@operator("solve_rows_again")
 def _solve_rows_again(rhs: Tensor, factor: Tensor) -> Tensor:
     """The same systems with other right-hand sides."""
     ky, kx = rhs.shape[-2:]
@@ -143,13 +144,13 @@ def _solve_rows_again(rhs: Tensor, factor: Tensor) -> Tensor:
     return rows.transpose(0, 1).reshape(rhs.shape).contiguous()
 
 
-@_solve_rows.register_fake
+@torch.library.register_fake("torchqm::solve_rows")
 def _(gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool, check: bool) -> tuple[Tensor, Tensor]:
     ky, kx = rhs.shape[-2:]
     return rhs.new_empty(rhs.shape), rhs.new_empty((ky, prod(rhs.shape[:-2]), kx, kx) if keep else 0)
 
 
-@_solve_rows_again.register_fake
+@torch.library.register_fake("torchqm::solve_rows_again")
 def _(rhs: Tensor, factor: Tensor) -> Tensor:
     return rhs.new_empty(rhs.shape)
 
@@ -215,7 +216,7 @@ def _to_front(size: int, tensors: Sequence[Tensor], in_dims: Sequence[int | None
     ]
 
 
-@_solve_rows.register_vmap
+@torch.library.register_vmap("torchqm::solve_rows")
 def _(
     info: Any, in_dims: Any, gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool, check: bool
 ) -> tuple[tuple[Tensor, Tensor], tuple[int, int | None]]:
@@ -226,7 +227,7 @@ def _(
     return (rows, factor.unflatten(1, (info.batch_size, -1))), (0, 1)
 
 
-@_solve_rows_again.register_vmap
+@torch.library.register_vmap("torchqm::solve_rows_again")
 def _(info: Any, in_dims: Any, rhs: Tensor, factor: Tensor) -> tuple[Tensor, int]:
     (rhs,) = _to_front(info.batch_size, (rhs,), in_dims[:1])
     # The samples of all elements of the batch in one dimension, in the order of the right-hand sides.

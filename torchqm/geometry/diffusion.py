@@ -1,10 +1,9 @@
 """Smoothing of functions on a mesh by one implicit step of heat flow."""
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float
-from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, cg
 from torch import Tensor
 
 from torchqm.geometry.laplacian import cotan_stiffness, to_scipy
@@ -40,12 +39,12 @@ def diffused(mesh: Mesh, values: Float[Tensor, "V C"], time: float, rtol: float 
     mass = mesh.vertex_areas.numpy()
     there = mass > 0
     matrix = (
-        sparse.diags_array(np.where(there, mass, 1.0)) + time * to_scipy(cotan_stiffness(mesh.verts, mesh.faces))
+        scipy.sparse.diags_array(np.where(there, mass, 1.0)) + time * to_scipy(cotan_stiffness(mesh.verts, mesh.faces))
     ).tocsr()
     inverse = 1 / matrix.diagonal()
-    scaling = LinearOperator(matrix.shape, matvec=lambda v: inverse * v, dtype=np.float64)
+    scaling = scipy.sparse.linalg.LinearOperator(matrix.shape, matvec=lambda v: inverse * v, dtype=np.float64)
     columns = []
     for f in values.numpy().T.astype(np.float64):
         right = np.where(there, mass * f, f)
-        columns.append(cg(matrix, right, x0=f, rtol=rtol, M=scaling, maxiter=1000)[0])
+        columns.append(scipy.sparse.linalg.cg(matrix, right, x0=f, rtol=rtol, M=scaling, maxiter=1000)[0])
     return torch.from_numpy(np.stack(columns, 1)) if columns else values

@@ -5,10 +5,9 @@ from typing import Any, NamedTuple
 from warnings import warn
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 
 from torchqm.geometry.check import clean_faces, inspect_mesh, orient_faces
@@ -165,7 +164,7 @@ def nodal_crossings(mesh: Mesh, f: Float[Tensor, " V"]) -> EdgePoints:
     return EdgePoints(edges[crossed], (a / size) / (a / size - b / size))
 
 
-def edge_graph(mesh: Mesh) -> csr_array:
+def edge_graph(mesh: Mesh) -> "scipy.sparse.csr_array":
     """Symmetric ``(V, V)`` matrix of edge lengths; edges of length 0 are stored entries."""
     edges, lengths = mesh.edges.numpy(), mesh.edge_lengths.numpy()
     return _symmetric_graph(mesh.n_verts, edges, lengths)
@@ -234,7 +233,7 @@ class _Surface:
         flaps = np.stack([b, a, apex], axis=1)
         return potpourri3d.MeshFastMarchingDistanceSolver(verts, np.concatenate([faces, flaps])), self.n
 
-    def graph(self) -> csr_array:
+    def graph(self) -> "scipy.sparse.csr_array":
         compact = self.compact
         return _symmetric_graph(self.n, compact.edges.numpy(), compact.edge_lengths.numpy())
 
@@ -254,7 +253,7 @@ def _heat(surface: _Surface) -> _FromSource:
     import potpourri3d
 
     solver = potpourri3d.MeshHeatMethodDistanceSolver(surface.verts, surface.faces)
-    _, piece = connected_components(surface.graph(), directed=False)
+    _, piece = scipy.sparse.csgraph.connected_components(surface.graph(), directed=False)
 
     def from_source(source: int) -> np.ndarray:
         out = np.asarray(solver.compute_distance(source)).reshape(-1)
@@ -265,7 +264,7 @@ def _heat(surface: _Surface) -> _FromSource:
 
 def _dijkstra(surface: _Surface) -> _FromSource:
     graph = surface.graph()
-    return lambda source: dijkstra(graph, indices=np.array([source]))[0]
+    return lambda source: scipy.sparse.csgraph.dijkstra(graph, indices=np.array([source]))[0]
 
 
 def _dijkstra_from_seeds(surface: _Surface, seeds: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -273,8 +272,8 @@ def _dijkstra_from_seeds(surface: _Surface, seeds: np.ndarray, start: np.ndarray
     graph = surface.graph().tocoo()
     row = np.concatenate([graph.row, np.full(len(seeds), surface.n)])
     col, value = np.concatenate([graph.col, seeds]), np.concatenate([graph.data, start])
-    whole = coo_array((value, (row, col)), shape=(surface.n + 1, surface.n + 1)).tocsr()
-    return dijkstra(whole, indices=np.array([surface.n]))[0, : surface.n]
+    whole = scipy.sparse.coo_array((value, (row, col)), shape=(surface.n + 1, surface.n + 1)).tocsr()
+    return scipy.sparse.csgraph.dijkstra(whole, indices=np.array([surface.n]))[0, : surface.n]
 
 
 def _exact(surface: _Surface) -> _FromSource:
@@ -305,9 +304,9 @@ def _vertex_ids(mesh: Mesh, name: str, ids: Tensor | np.ndarray | list[int]) -> 
     return array
 
 
-def _symmetric_graph(n: int, edges: np.ndarray, lengths: np.ndarray) -> csr_array:
+def _symmetric_graph(n: int, edges: np.ndarray, lengths: np.ndarray) -> "scipy.sparse.csr_array":
     row, col = np.concatenate([edges[:, 0], edges[:, 1]]), np.concatenate([edges[:, 1], edges[:, 0]])
-    return coo_array((np.concatenate([lengths, lengths]), (row, col)), shape=(n, n)).tocsr()
+    return scipy.sparse.coo_array((np.concatenate([lengths, lengths]), (row, col)), shape=(n, n)).tocsr()
 
 
 def _curve_seeds(mesh: Mesh, surface: _Surface, curve: EdgePoints) -> tuple[np.ndarray, np.ndarray]:

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array, csr_array
 from torch import Tensor
 
 from torchqm.geometry.check import DEGENERATE_HEIGHT, MeshReport, clean_faces, inspect_mesh
@@ -204,7 +204,7 @@ def _choose(report: MeshReport) -> tuple[str, str]:
     return "cotan", f"manifold, no flat triangle, {share}"
 
 
-def to_scipy(sparse: Tensor) -> csr_array:
+def to_scipy(sparse: Tensor) -> "scipy.sparse.csr_array":
     """A sparse torch matrix as ``scipy.sparse.csr_array``.
 
     Args:
@@ -219,4 +219,4 @@ def to_scipy(sparse: Tensor) -> csr_array:
     """
     coo = sparse.detach().cpu().to_sparse_coo().coalesce()
     row, col = coo.indices().numpy()
-    return coo_array((coo.values().numpy(), (row, col)), shape=tuple(coo.shape)).tocsr()
+    return scipy.sparse.coo_array((coo.values().numpy(), (row, col)), shape=tuple(coo.shape)).tocsr()

@@ -1,9 +1,9 @@
 """Choosing vertices: at random in proportion to area, or spread out so that each is far from all before it."""
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Int
-from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
 from torchqm.geometry.geodesic import edge_graph
@@ -90,7 +90,9 @@ def farthest_points(mesh: Mesh, n: int, start: int | None = None, method: str = 
             offsets = verts - verts[point]
             distance = np.einsum("vi,vi->v", offsets, offsets)  # squared: the order is the same
         else:
-            distance = dijkstra(graph, indices=np.array([point]), limit=max(float(nearest.max()), 0.0))[0]
+            distance = scipy.sparse.csgraph.dijkstra(
+                graph, indices=np.array([point]), limit=max(float(nearest.max()), 0.0)
+            )[0]
         np.minimum(nearest, distance, out=nearest)
         nearest[point] = -1.0
         point = int(nearest.argmax())

@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 __all__ = [
     "EdgeTable",
@@ -91,8 +90,8 @@ def triangle_shapes(verts: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, n
 
 def components(n: int, rows: np.ndarray, cols: np.ndarray) -> tuple[int, np.ndarray]:
     """Number of connected pieces of an undirected graph on ``n`` nodes, and the piece of each node."""
-    graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, cols)), shape=(n, n)).tocsr()
-    count, label = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_array((np.ones(len(rows), dtype=np.int8), (rows, cols)), shape=(n, n)).tocsr()
+    count, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
     return int(count), label
 
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchqm.geometry.mesh import Mesh
@@ -86,9 +86,9 @@ def find_reflections(mesh: Mesh, n_samples: int = 500, n_refine: int = 3, seed: 
     centre = weights @ verts
     verts = verts - centre
     used = np.flatnonzero(weights > 0)
-    tree = cKDTree(verts[used])
+    tree = scipy.spatial.cKDTree(verts[used])
     few, many = (verts[area_samples(mesh, min(n, used.size), seed).numpy()] for n in (n_samples, 4 * n_samples))
-    coarse = cKDTree(verts[area_samples(mesh, min(5000, used.size), seed).numpy()])
+    coarse = scipy.spatial.cKDTree(verts[area_samples(mesh, min(5000, used.size), seed).numpy()])
     spacing = float(np.sqrt((np.asarray(tree.query(many, k=2)[0])[:, 1] ** 2).mean()))
     coarse_spacing = float(np.sqrt((np.asarray(coarse.query(few, k=2)[0])[:, 1] ** 2).mean()))
 
@@ -155,7 +155,7 @@ def extrinsic_group(mesh: Mesh, planes: Sequence[ExtrinsicReflection], most: int
     verts, mass = mesh.verts.numpy(), mesh.vertex_areas.numpy()
     used = np.flatnonzero(mass > 0)
     scale = float(mesh.area) ** 0.5
-    tree = cKDTree(verts[used])
+    tree = scipy.spatial.cKDTree(verts[used])
     motions = [(np.eye(3), np.zeros(3))]
     maps, residuals = [np.arange(len(verts))], [0.0]
     for plane in planes:
@@ -204,7 +204,7 @@ class _Planes(NamedTuple):
         return points - 2 * heights[:, :, None] * self.normals[:, None, :]
 
 
-def _ranked(tree: cKDTree, points: np.ndarray, planes: _Planes) -> tuple[_Planes, np.ndarray]:
+def _ranked(tree: "scipy.spatial.cKDTree", points: np.ndarray, planes: _Planes) -> tuple[_Planes, np.ndarray]:
     """Planes by their root mean square distance, best first, and these distances."""
     fits = _fits(tree, points, planes)
     order = np.argsort(fits, kind="stable")
@@ -244,17 +244,17 @@ def _half_sphere(n: int) -> np.ndarray:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
 
 
-def _nearest(tree: cKDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _nearest(tree: "scipy.spatial.cKDTree", points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     distance, index = tree.query(points, workers=torch.get_num_threads())
     return np.asarray(distance), np.asarray(index)
 
 
-def _fits(tree: cKDTree, points: np.ndarray, planes: _Planes) -> np.ndarray:
+def _fits(tree: "scipy.spatial.cKDTree", points: np.ndarray, planes: _Planes) -> np.ndarray:
     """``(P,)`` root mean square distance of the mirrored points from the surface."""
     return np.sqrt((_nearest(tree, planes.mirror(points))[0] ** 2).mean(1))
 
 
-def _reflective_icp(tree: cKDTree, points: np.ndarray, planes: _Planes, steps: int) -> _Planes:
+def _reflective_icp(tree: "scipy.spatial.cKDTree", points: np.ndarray, planes: _Planes, steps: int) -> _Planes:
     """Steps of reflective ICP for all the planes at once; those that no longer change are left alone."""
     normals, offsets = planes.normals.copy(), planes.offsets.copy()
     moving = np.arange(len(offsets))

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial import ConvexHull, QhullError
 
 from torchqm.geometry.mesh import Mesh
 
@@ -40,8 +40,8 @@ FRONT = View()
 def _flat_hull(points: np.ndarray) -> tuple[float, np.ndarray]:
     """Area and half-plane equations of the hull of points in the plane; area 0 when they lie on a line."""
     try:
-        hull = ConvexHull(points)
-    except (QhullError, ValueError):  # fewer than three points, or all on a line
+        hull = scipy.spatial.ConvexHull(points)
+    except (scipy.spatial.QhullError, ValueError):  # fewer than three points, or all on a line
         return 0.0, np.zeros((0, 3))
     return float(hull.volume), hull.equations
 

@@ -3,9 +3,8 @@
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Shaped
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from torchqm.geometry.mesh import Mesh
@@ -116,7 +115,9 @@ def _surface(attrs: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     closed = not rim.any()
     if not closed:
         tail, head = tail[rim], head[rim]
-        _, ring = connected_components(coo_array((np.ones(len(tail)), (tail, head)), shape=(n, n)), directed=False)
+        _, ring = scipy.sparse.csgraph.connected_components(
+            scipy.sparse.coo_array((np.ones(len(tail)), (tail, head)), shape=(n, n)), directed=False
+        )
         loop = np.unique(ring[tail], return_inverse=True)[1]
         perimeter = np.bincount(loop, np.linalg.norm(attrs[tail, :3] - attrs[head, :3], axis=1))
         small = perimeter < 0.2 * np.linalg.norm(np.ptp(attrs[:, :3], axis=0))
@@ -126,7 +127,9 @@ def _surface(attrs: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
         closed = bool(small.all())
     if closed:
         edges = (np.ones(2 * len(faces)), (faces[:, [0, 0]].reshape(-1), faces[:, [1, 2]].reshape(-1)))
-        part = connected_components(coo_array(edges, shape=(len(attrs),) * 2), directed=False)[1][faces[:, 0]]
+        part = scipy.sparse.csgraph.connected_components(
+            scipy.sparse.coo_array(edges, shape=(len(attrs),) * 2), directed=False
+        )[1][faces[:, 0]]
         volume = np.bincount(part, np.linalg.det(attrs[faces, :3] - attrs[faces, :3].mean((0, 1))))
         faces = np.where((volume[part] < 0)[:, None], faces[:, ::-1], faces)
     return attrs, faces, True, closed

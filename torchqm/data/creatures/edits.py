@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import sparse
+import scipy
 
 __all__ = ["OPPOSITE", "Patch", "collapse", "edge_lengths", "edge_table", "face_vectors", "flip", "split"]
 
@@ -128,7 +128,9 @@ def collapse(patch: Patch, cosine: float, salt: int) -> tuple[Patch, int]:
     np.minimum.at(near, a, best[b])
     np.minimum.at(near, b, best[a])
     ids = ids[(near[a[ids]] == rank[ids]) & (near[b[ids]] == rank[ids])]
-    adjacency = sparse.csr_matrix((np.ones(2 * len(edges), dtype=np.int32), (np.r_[a, b], np.r_[b, a])), shape=(n, n))
+    adjacency = scipy.sparse.csr_matrix(
+        (np.ones(2 * len(edges), dtype=np.int32), (np.r_[a, b], np.r_[b, a])), shape=(n, n)
+    )
     common = adjacency[a[ids]].multiply(adjacency[b[ids]]).tocsr()
     ids = ids[(common @ np.ones(n) == np.where(boundary[ids], 1, 2)) & (common @ lean == 0)]
     both = keep_a[ids] & keep_b[ids]

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 __all__ = ["closest_points", "normal_points"]
 
@@ -40,7 +40,7 @@ def _candidates(verts: np.ndarray, faces: np.ndarray) -> Callable[[np.ndarray], 
     order = np.argsort(faces.reshape(-1), kind="stable")
     ring = order // 3
     start = np.concatenate([[0], np.cumsum(np.bincount(faces.reshape(-1), minlength=len(verts)))])
-    tree = cKDTree(verts)
+    tree = scipy.spatial.cKDTree(verts)
 
     def pairs(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         near = tree.query(q, k=4)[1].reshape(-1)

@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline, PchipInterpolator
+import scipy
 
 __all__ = ["Chain", "Joint", "Skeleton", "reflection_group"]
 
@@ -64,7 +64,8 @@ class Chain:
         spans = [np.linspace(chord[i], chord[i + 1], steps[i], endpoint=False) for i in range(n - 1)]
         u = np.concatenate([*spans, chord[-1:]])
         at_nodes = np.concatenate([[0], np.cumsum(steps)])
-        return CubicSpline(chord, self.nodes)(u), PchipInterpolator(chord, self.radii)(u), at_nodes
+        centres = scipy.interpolate.CubicSpline(chord, self.nodes)(u)
+        return centres, scipy.interpolate.PchipInterpolator(chord, self.radii)(u), at_nodes
 
     @property
     def points(self) -> np.ndarray:

@@ -1,5 +1,6 @@
 """The matchers of a comparison by name."""
 
+from torchqm.catalogue import DESCRIPTIONS
 from torchqm.matching.baselines.axis_curves import AxisCurves
 from torchqm.matching.baselines.base import Matcher
 from torchqm.matching.baselines.descriptors import NearestDescriptors
@@ -31,23 +32,6 @@ MATCHERS: dict[str, Matcher] = {
     )
 }
 """Each with its standard options; for other options make one yourself, under another name."""
-
-DESCRIPTIONS: dict[str, str] = {
-    "quotient": "torchqm, automatic: symmetries from the two shapes alone",
-    "quotient-estimated-axis": "torchqm, symmetries by transfer from an undeformed pose",
-    "quotient-true-axis": "torchqm, symmetries given",
-    "paper": "quotient spaces as published (SGP 2013); undeformed pose used if there is one",
-    "semi": "semi-quotient matching alone (SGP 2013, section 5)",
-    "fmap": "functional maps: descriptors, commutativity, ICP (SIGGRAPH 2012)",
-    "zoomout": "ZoomOut from the start of fmap (SIGGRAPH Asia 2019)",
-    "zoomout-fast": "ZoomOut on 1000 farthest points",
-    "orient-rev": "self-symmetry: orientation-reversing functional map (SIGGRAPH Asia 2018), then ZoomOut",
-    "descriptors": "nearest wave kernel signatures",
-    "axis-curves": "symmetry axis curves, true axis given (SGP 2012)",
-    "symmetry-factored": "quotient matching with L2+ from a symmetry-factored embedding (SIGGRAPH 2010)",
-    "pyfm": "pyFM 1.3: fit and ZoomOut on 3000 points",
-}
-"""One line for ``--help`` and tables."""
 
 
 def get_matcher(name: str) -> Matcher:
