@@ -6,6 +6,7 @@ import scipy.sparse as sp
 import torch
 from references.shapes import icosphere
 
+from torchqm.data.synthetic import creature
 from torchqm.geometry import Mesh, laplacian, to_scipy
 from torchqm.spectral.lanczos import LanczosError, lowest_eigenpairs
 
@@ -66,6 +67,19 @@ def test_clusters_wider_than_a_block_are_complete():
     np.testing.assert_allclose(found.evals, torus_spectrum(12, 81), atol=1e-9)
     assert found.attempts > 1  # up to 24 equal eigenvalues do not come out of blocks of 16
     assert np.diff(found.evals).max() > 0.1
+
+
+@pytest.mark.parametrize("mesh", [icosphere(3), creature("octopus", 600).mesh], ids=["sphere", "octopus"])
+def test_equal_eigenvalues_of_a_symmetric_shape_are_complete(mesh):
+    matrix = scaled(mesh)
+    evals, evecs = np.linalg.eigh(matrix.toarray())
+    ends = np.flatnonzero(np.diff(evals) > 1e-3 * evals[1:])  # cut where no cluster goes on
+    k = int(ends[ends < 60][-1]) + 1
+    pairs = lowest_eigenpairs(matrix, k, 1e-10, 4 * np.pi * k)
+    np.testing.assert_allclose(pairs.evals[1:], evals[1:k], rtol=1e-11)
+    missed = evecs[:, :k] - pairs.evecs.numpy().T @ (pairs.evecs.numpy() @ evecs[:, :k])
+    assert np.linalg.norm(missed, axis=0).max() < 1e-7
+    assert (np.diff(evals[1:k]) < 1e-6 * evals[2:k]).sum() >= 10  # there is something to be missed
 
 
 def test_every_component_has_its_constant():

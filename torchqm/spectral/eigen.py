@@ -3,9 +3,7 @@
 import warnings
 
 import numpy as np
-import scipy.linalg as sl
-import scipy.sparse as sp
-import scipy.sparse.linalg as spla
+import scipy
 import torch
 from jaxtyping import Float
 from threadpoolctl import threadpool_limits
@@ -107,7 +105,7 @@ def eigenbasis(
     stiffness = to_scipy(operator.stiffness).tocsr()
     if used.size < mass.size:
         stiffness = stiffness[used][:, used]
-    scale = sp.diags_array(1 / root)
+    scale = scipy.sparse.diags_array(1 / root)
     matrix = (scale @ stiffness @ scale).tocsc()
     evals, rows = _solve(((matrix + matrix.T) / 2).tocsc(), k, tol, solver, name)
     evecs = torch.zeros(mass.size, k, dtype=torch.float64)
@@ -115,11 +113,11 @@ def eigenbasis(
     return SpectralBasis(torch.from_numpy(np.maximum(evals, 0.0) / area), fix_signs(evecs), operator.mass)
 
 
-def _solve(matrix: sp.csc_array, k: int, tol: float, solver: str, name: str) -> tuple[np.ndarray, Tensor]:
+def _solve(matrix: "scipy.sparse.csc_array", k: int, tol: float, solver: str, name: str) -> tuple[np.ndarray, Tensor]:
     """Eigenvalues ``(k,)`` ascending and eigenvectors as rows ``(k, n)``."""
     n = matrix.shape[0]
     if solver == "dense" or (solver == "auto" and n <= max(_DENSE_SIZE, 3 * k)) or k > n - 2 * BLOCK:
-        evals, vectors = sl.eigh(matrix.toarray(), subset_by_index=[0, k - 1])
+        evals, vectors = scipy.linalg.eigh(matrix.toarray(), subset_by_index=[0, k - 1])
         return evals, torch.from_numpy(np.ascontiguousarray(vectors.T))
     if solver != "arpack":
         try:
@@ -136,7 +134,7 @@ def _solve(matrix: sp.csc_array, k: int, tol: float, solver: str, name: str) -> 
     return evals[order], torch.from_numpy(np.ascontiguousarray(vectors[:, order].T))
 
 
-def _require_residuals(matrix: sp.csc_array, residuals: np.ndarray, evals: np.ndarray, tol: float) -> None:
+def _require_residuals(matrix: "scipy.sparse.csc_array", residuals: np.ndarray, evals: np.ndarray, tol: float) -> None:
     # The product A x alone is wrong by eps |A|; the lowest eigenvalues feel it most.
     rounding = np.finfo(np.float64).eps * abs(matrix).sum(0).max() / np.maximum(evals, np.median(evals) / len(evals))
     allowed = np.maximum(tol, 10 * rounding)
@@ -145,23 +143,25 @@ def _require_residuals(matrix: sp.csc_array, residuals: np.ndarray, evals: np.nd
         raise LanczosError(f"pair {worst} of {len(residuals)} has a residual of {residuals[worst]:.2g}, not {tol:g}")
 
 
-def _shift_invert(matrix: sp.csc_array, k: int, name: str) -> tuple[np.ndarray, np.ndarray]:
+def _shift_invert(matrix: "scipy.sparse.csc_array", k: int, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Shift-invert Lanczos (ARPACK, sparse factorisation): the slow way, one vector at a time."""
     n = matrix.shape[0]
     # SymmetricMode with minimum degree on A + A^T keeps the fill of a Cholesky factor; the default ordering doubles it.
-    factor = spla.splu(
-        (matrix - SHIFT * sp.eye_array(n, format="csc")).tocsc(),
+    factor = scipy.sparse.linalg.splu(
+        (matrix - SHIFT * scipy.sparse.eye_array(n, format="csc")).tocsc(),
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
-    inverse = spla.LinearOperator((n, n), matvec=factor.solve, dtype=np.float64)
+    inverse = scipy.sparse.linalg.LinearOperator((n, n), matvec=factor.solve, dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(n)
     try:
         # ARPACK calls BLAS on vectors: threads only wait for each other there (4 s became 20 on a busy machine).
         with threadpool_limits(1, "blas"):
-            return spla.eigsh(matrix, k=k, sigma=SHIFT, which="LM", OPinv=inverse, v0=start, ncv=min(n - 1, 2 * k + 20))
-    except spla.ArpackNoConvergence as error:
+            return scipy.sparse.linalg.eigsh(
+                matrix, k=k, sigma=SHIFT, which="LM", OPinv=inverse, v0=start, ncv=min(n - 1, 2 * k + 20)
+            )
+    except scipy.sparse.linalg.ArpackNoConvergence as error:
         raise SpectrumError(
             f"{name}: ARPACK found {len(error.eigenvalues)} of {k} eigenpairs ({error}); "
             "ask for fewer, or look at the mesh with check_mesh"

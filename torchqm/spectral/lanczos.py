@@ -4,8 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg as sl
-import scipy.sparse as sp
+import scipy
 import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
@@ -54,7 +53,9 @@ class LanczosPairs:
     attempts: int
 
 
-def lowest_eigenpairs(matrix: sp.csc_array, k: int, tol: float, guess: float, block: int = BLOCK) -> LanczosPairs:
+def lowest_eigenpairs(
+    matrix: "scipy.sparse.csc_array", k: int, tol: float, guess: float, block: int = BLOCK
+) -> LanczosPairs:
     """The ``k`` lowest eigenpairs of a sparse symmetric positive semidefinite matrix.
 
     Lanczos finds first what lies far out in the spectrum of its operator. For the inverse alone these are few of the
@@ -102,7 +103,7 @@ def lowest_eigenpairs(matrix: sp.csc_array, k: int, tol: float, guess: float, bl
 class _Run:
     """One Lanczos run with one filter; rows of ``vectors`` are orthonormal."""
 
-    def __init__(self, matrix: sp.csc_array, k: int, tol: float, guess: float, block: int) -> None:
+    def __init__(self, matrix: "scipy.sparse.csc_array", k: int, tol: float, guess: float, block: int) -> None:
         n = matrix.shape[0]
         self.matrix, self.k, self.tol, self.guess, self.block = matrix, k, tol, guess, block
         self.shift = _SHIFT * guess
@@ -145,7 +146,7 @@ class _Run:
         self.vectors = start  # the long list is not needed any more
         solved = self.solve(start)
         gram, form = (solved @ solved.T).numpy(), (solved @ start.T).numpy()  # (A + s) solved = start
-        shifted, turn = sl.eigh((form + form.T) / 2, (gram + gram.T) / 2)
+        shifted, turn = scipy.linalg.eigh((form + form.T) / 2, (gram + gram.T) / 2)
         evecs = torch.from_numpy(turn.T.copy()) @ solved
         evals = shifted - self.shift
         applied = (self.matrix @ evecs.numpy().T).T - evals[:, None] * evecs.numpy()
@@ -223,11 +224,11 @@ class _Run:
         return basis
 
 
-def _solver(matrix: sp.csc_array, shift: float) -> Operation:
+def _solver(matrix: "scipy.sparse.csc_array", shift: float) -> Operation:
     """Solves with ``A + shift`` for each row, a few rows at a time."""
     import cholespy
 
-    shifted = sp.csc_array(matrix + shift * sp.eye_array(matrix.shape[0], format="csc"))
+    shifted = scipy.sparse.csc_array(matrix + shift * scipy.sparse.eye_array(matrix.shape[0], format="csc"))
     shifted.sort_indices()
     try:
         factor = cholespy.CholeskySolverD(
