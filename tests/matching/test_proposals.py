@@ -20,7 +20,7 @@ from torchqm.matching.proposals import (
     propose,
     regrown,
 )
-from torchqm.matching.quality import distance_change
+from torchqm.matching.quality import displacement, distance_change
 from torchqm.matching.self_map import nearest_involution, reflection_score
 
 FULL = MatchParameters(k_max=100)
@@ -172,12 +172,26 @@ def test_between_close_maps_distances_decide(biped):
     right, half = biped.fmaps[1], biped.half(1, 1).fmap
     change = [distance_change(fmap, biped.shape, biped.shape) for fmap in (right, half)]
     assert change[0] < change[1]
-    wrong, close = Proposal(half, -1, True, 0.10), Proposal(right, -1, True, 0.108)
-    far = replace(close, score=0.112)
+    wrong, close = Proposal(half, -1, True, 0.10), Proposal(right, -1, True, 0.14)
+    far = replace(close, score=0.16)
     assert _ranked([wrong, close], biped.shape) == [close, wrong]
     assert _ranked([far, wrong], biped.shape) == [wrong, far]
     turning = replace(close, orientation=1, score=0.101)
     assert _ranked([turning, replace(close, score=0.11)], biped.shape)[0].orientation == -1
+
+
+def test_a_map_that_hardly_moves_points_is_not_praised_for_changing_no_distances(biped):
+    """The identity but for some high functions changes distances less than an inexact symmetry does."""
+    exact = biped.fmaps[1]
+    noise = torch.randn(exact.shape, generator=torch.Generator().manual_seed(0), dtype=exact.dtype)
+    still = torch.ones(len(exact), dtype=torch.float64)
+    still[40:] = -1.0
+    right = Proposal(nearest_involution(exact + 0.16 * (noise + noise.T)), -1, True, 0.11)
+    idle = Proposal(torch.diag(still), -1, True, 0.10)
+    changes = [distance_change(p.fmap, biped.shape, biped.shape) for p in (right, idle)]
+    moved = [displacement(p.fmap, biped.shape.basis.evals) for p in (right, idle)]
+    assert changes[1] < changes[0] < changes[1] * moved[0] / moved[1]
+    assert _ranked([idle, right], biped.shape) == [right, idle]
 
 
 def test_signs_of_eigenfunctions_where_there_are_few_tips():

@@ -10,7 +10,7 @@ from torchqm.fmap.refine import nearest_isometry
 from torchqm.matching.landmark_maps import LandmarkMaps
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.parity import parity_patterns
-from torchqm.matching.quality import distance_change
+from torchqm.matching.quality import displacement, distance_change
 from torchqm.matching.self_map import grow_self_map, nearest_involution, reflection_score
 from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.descriptors import wave_energies, wave_kernel_signature
@@ -30,9 +30,8 @@ best on all shapes; these four together had the best candidates on the harder on
 FIRST, SECOND, CHOICE = 40, 60, 100
 """Functions at which all maps, the better ones, and the best ones are compared."""
 
-CLOSE = 1.1
-"""Maps with up to this multiple of the best score are ranked by how they change distances, too. At 1.35 a wrong map
-took the place of a better one on two of TOSCA's poses; at 1.1 one cat is worse, and 20 bipeds are as before."""
+CLOSE = 1.5
+"""Maps with up to this multiple of the best score are ranked by how they change distances, too."""
 
 FEW = 40
 """Proposals from landmarks below which signs of eigenfunctions are tried, too: an egg has two tips."""
@@ -173,17 +172,20 @@ def _unseen(
 
 
 def _ranked(pool: list[Proposal], x: PreparedShape) -> list[Proposal]:
-    """By score; those that are close to the best one by the product of score and change of distances.
+    """By score; those that are close to the best one by score times change of distances over displacement.
 
-    Commutativity alone does not see that a map joins the halves of two symmetries; distances across the shape do. Of a
-    person, what turns front to back can look nearly as good as what mirrors left and right.
+    Commutativity alone does not see that a map joins the halves of two symmetries; distances across the shape do. And a
+    map that leaves points near where they are changes little, whether it is a symmetry or not: of a person, what turns
+    front to back changes distances less than what mirrors left and right, but moves points half as far.
     """
     limit = CLOSE * min((p.score for p in pool), default=0.0)
 
     def key(proposal: Proposal) -> tuple[bool, float]:
         score = proposal.score * (1.3 if proposal.orientation > 0 else 1.0)
         far = proposal.score > limit
-        return far, score if far else score * distance_change(proposal.fmap, x, x)
+        return far, score if far else score * distance_change(proposal.fmap, x, x) / max(
+            displacement(proposal.fmap, x.basis.evals), 1e-3
+        )
 
     return sorted(pool, key=key)
 

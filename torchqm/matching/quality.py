@@ -13,6 +13,7 @@ from torchqm.spectral.basis import SpectralBasis
 __all__ = [
     "commutativity_score",
     "commutator_norm",
+    "displacement",
     "distance_change",
     "map_label",
     "orientation_agreement",
@@ -67,6 +68,27 @@ def distance_change(
         gaps.append(((before - before.roll(step, 0)).norm(dim=1), (after - after.roll(step, 0)).norm(dim=1)))
     change = sum(float((b - a).abs().mean()) for b, a in gaps)
     return change / max(sum(float(b.mean()) for b, _ in gaps), 1e-300)
+
+
+def displacement(fmap: Float[Tensor, "K K"], evals: Float[Tensor, " N"]) -> float:
+    """How far a self-map moves the points of a shape: 0 for the identity, about 1 if it were none of its own doing.
+
+    Root mean square of the biharmonic distances between points and their images, over that between any two points:
+    ``|| L^-1 (C - I) || / (sqrt(2) || L^-1 ||)`` with the eigenvalues ``L``, the constant left out.
+
+    Args:
+        fmap: orthonormal.
+        evals: ``(N,)`` ascending, N at least K; the first is that of the constant.
+
+    Example:
+        >>> evals = torch.tensor([0.0, 1.0, 2.0])
+        >>> displacement(torch.eye(3), evals), round(displacement(torch.diag(torch.tensor([1.0, -1.0, 1.0])), evals), 4)
+        (0.0, 1.2649)
+    """
+    k = fmap.shape[0]
+    weights = 1 / evals[1:k].clamp_min(torch.finfo(evals.dtype).tiny)
+    moved = weights[:, None] * (fmap - torch.eye(k, dtype=fmap.dtype, device=fmap.device))[1:, 1:]
+    return float(moved.norm() / (2**0.5 * weights.norm()))
 
 
 def orientation_agreement(mesh_x: Mesh, mesh_y: Mesh, p2p_xy: Int[Tensor, " Vx"]) -> float:
