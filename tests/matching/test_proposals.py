@@ -172,8 +172,8 @@ def test_between_close_maps_distances_decide(biped):
     right, half = biped.fmaps[1], biped.half(1, 1).fmap
     change = [distance_change(fmap, biped.shape, biped.shape) for fmap in (right, half)]
     assert change[0] < change[1]
-    wrong, close = Proposal(half, -1, True, 0.10), Proposal(right, -1, True, 0.14)
-    far = replace(close, score=0.16)
+    wrong, close = Proposal(half, -1, True, 0.10), Proposal(right, -1, True, 0.12)
+    far = replace(close, score=0.13)
     assert _ranked([wrong, close], biped.shape) == [close, wrong]
     assert _ranked([far, wrong], biped.shape) == [wrong, far]
     turning = replace(close, orientation=1, score=0.101)

@@ -30,7 +30,7 @@ best on all shapes; these four together had the best candidates on the harder on
 FIRST, SECOND, CHOICE = 40, 60, 100
 """Functions at which all maps, the better ones, and the best ones are compared."""
 
-CLOSE = 1.5
+CLOSE = 1.25
 """Maps with up to this multiple of the best score are ranked by how they change distances, too."""
 
 FEW = 40
