@@ -11,7 +11,8 @@ from torchqm.fmap.convert import nearest_used, p2p_to_fmap
 from torchqm.fmap.refine import growing_sizes, nearest_isometry, quotient_icp, upsample
 from torchqm.fmap.solve import solve_fmap
 from torchqm.fmap.two_way import Places, growing_pairs, two_way_upsample
-from torchqm.matching.initial import basis_size, shared_descriptors, unit_columns_pair
+from torchqm.matching.described import PairDescriptors, pair_descriptors
+from torchqm.matching.initial import basis_size, unit_columns_pair
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.quality import commutator_norm
 from torchqm.matching.shape import N_ANCHORS, PreparedShape
@@ -61,7 +62,7 @@ def self_maps_from_halves(
     x: PreparedShape,
     sign: Float[Tensor, " V"],
     parameters: MatchParameters,
-    values: Float[Tensor, "V C"] | None = None,
+    values: Float[Tensor, "V C"] | PairDescriptors | None = None,
 ) -> list[Float[Tensor, "K K"]]:
     """Solve ``S f = f`` and ``S (eps f) = -eps f`` for all descriptors f, then refine by ICP; one map a weight.
 
@@ -70,15 +71,17 @@ def self_maps_from_halves(
         sign: its left-right map eps.
         parameters: ``k``, descriptors, ``icp_steps``; each of ``self_commutativity`` gives a candidate, as no single
             weight is best on all shapes.
-        values: descriptors f, if they are there already.
+        values: descriptors f, if they are there already, or those that x, the first of two shapes, shares with another.
 
     References:
         Paper, section 6.1, symmetry reconstruction.
     """
     basis = x.basis.truncate(basis_size([x.basis], parameters.k))
-    if values is None:
-        (values,) = shared_descriptors([x.basis], parameters)
-    even, odd = basis.coefficients(values), basis.coefficients(sign[:, None] * values)
+    if isinstance(values, Tensor):
+        even, odd = basis.coefficients(values), basis.coefficients(sign[:, None] * values)
+    else:
+        described = values or pair_descriptors(x, x, parameters)
+        even, odd = described.coefficients[0][: basis.k], described.weighted(x, basis.k, sign)
     f, g = unit_columns_pair(torch.cat([even, odd], 1), torch.cat([even, -odd], 1))
     samples, among = x.samples[: parameters.n_samples], basis.restricted(x.anchors)
     found: list[Tensor] = []
