@@ -42,7 +42,8 @@ def test_computed_once_and_turned_for_the_other_order(shapes, monkeypatch):
     monkeypatch.setattr(described, "_computed", lambda *_: pytest.fail("computed again"))
     assert pair_descriptors(x, y, FAST.changed(k=9)) is first
     turned = pair_descriptors(y, x, FAST.changed(k=9, commutativity=3.0))
-    assert turned.coefficients[0] is first.coefficients[1] and turned.coefficients[1] is first.coefficients[0]
+    assert turned.coefficients[0] is first.coefficients[1]
+    assert turned.coefficients[1] is first.coefficients[0]
 
 
 def test_other_parameters_and_more_functions_are_computed_anew(shapes):
@@ -60,7 +61,7 @@ def test_kept_no_longer_than_the_shapes():
     pair = exact_pair(2)
     x, y = pair.x, prepare(blob(4).mesh, 20)
     pair_descriptors(x, y, FAST)
-    assert x in described._KEPT and len(described._KEPT[x]) >= 1
+    assert y in described._KEPT[x]
     before = len(described._KEPT[x])
     del y
     gc.collect()

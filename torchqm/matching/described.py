@@ -79,7 +79,8 @@ def pair_descriptors(x: PreparedShape, y: PreparedShape, parameters: MatchParame
     n_functions = min(parameters.k_max, x.basis.k, y.basis.k)
     key = (k, n_functions, parameters.descriptor, parameters.n_descriptors, parameters.splits)
     for first, second in ((x, y), (y, x)):
-        found = _KEPT.get(first, {}).get(second, {}).get(key)
+        kept = _KEPT.get(first)
+        found = None if kept is None else kept.get(second, {}).get(key)
         if found is not None:
             return found if first is x else found.swapped()
     found = _computed(x, y, parameters, n_functions, k)
