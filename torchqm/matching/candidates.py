@@ -15,7 +15,7 @@ from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.quality import commutator_norm, distance_change
 from torchqm.matching.quotient import QuotientMatch, pair_places, refine_fmap
 from torchqm.matching.shape import PreparedShape
-from torchqm.matching.synchronize import synchronized_halves
+from torchqm.matching.synchronize import sample_weights, synchronized_halves
 from torchqm.symmetry.basis import SymmetrizedBasis, symmetrized_basis
 
 __all__ = ["FullMap", "full_map_from_blocks", "sharpened"]
@@ -90,7 +90,9 @@ def full_map_from_blocks(
         fmap = join_blocks(block.source, block.target, block.fmap, odd.fmap)
         found.append(FullMap(fmap, block, odd, ()))
     if places is not None:
-        found += [more for one in found if (more := _synchronized(one, x, y, known_x, known_y)) is not None]
+        weights = sample_weights(x, known_x)
+        more = [_synchronized(one, x, y, known_x, known_y, weights) for one in found]
+        found += [one for one in more if one is not None]
     if places is None or len(found) == 1:
         return replace(found[0], fmap=refine_fmap(found[0].fmap, x, y, parameters, places))
     few = places[0].fewer(1000, 3000), places[1].fewer(1000, 3000)
@@ -107,10 +109,15 @@ def _score(fmap: Float[Tensor, "K K"], x: PreparedShape, y: PreparedShape) -> fl
 
 
 def _synchronized(
-    full: FullMap, x: PreparedShape, y: PreparedShape, known_x: KnownSymmetry, known_y: KnownSymmetry
+    full: FullMap,
+    x: PreparedShape,
+    y: PreparedShape,
+    known_x: KnownSymmetry,
+    known_y: KnownSymmetry,
+    weights: Float[Tensor, "S S"],
 ) -> FullMap | None:
     """The map whose halves are chosen by neighbours, if the odd block chose otherwise on a tenth of the shape."""
-    halves = synchronized_halves(full.quotient, x, y, known_x, known_y)
+    halves = synchronized_halves(full.quotient, x, y, known_x, known_y, weights)
     source, target = full.quotient.source.full, full.quotient.target.full
     at_x = source.evecs[halves.samples]
     both = torch.stack([halves.images, known_y.group.maps[1][halves.images]])

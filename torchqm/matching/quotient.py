@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchqm.fmap.convert import fmap_to_p2p
+from torchqm.fmap.convert import deltas, fmap_to_p2p, nearest_used
 from torchqm.fmap.refine import correspondence_fmap, growing_sizes, quotient_icp, upsample
 from torchqm.fmap.two_way import Places, two_way_upsample
 from torchqm.matching.described import pair_descriptors
@@ -57,6 +57,11 @@ class QuotientMatch:
         Which point of the orbit stands here is arbitrary, and neighbours may differ in it.
         """
         return fmap_to_p2p(self.fmap, self.source.even, self.target.even, self.time, y.search, x.search)
+
+    def orbit_map_of(self, ids: Int[Tensor, " S"]) -> Int[Tensor, " S"]:
+        """The same of some source vertices, compared with all target vertices."""
+        images = deltas(self.source.even.restricted(ids), self.time) @ self.fmap.T
+        return nearest_used(images, self.target.even, self.time)
 
 
 def match_quotient(
