@@ -111,7 +111,8 @@ def match_prepared(
         maps = known_y.group.maps[:, p2p]
         agreement = [orientation_agreement(x.mesh, y.mesh, m) for m in maps]
         basis_y = y.basis.truncate(fmap.shape[0])
-        fmaps = torch.stack([p2p_to_fmap(m, basis_y, basis_y) @ fmap for m in known_y.group.maps])
+        # Row 0 is the identity.
+        fmaps = torch.stack([fmap, *(p2p_to_fmap(m, basis_y, basis_y) @ fmap for m in known_y.group.maps[1:])])
         label = "unknown"
         if oriented:
             omega_x, omega_y = (orientation_tensor(shape.mesh, shape.basis) for shape in (x, y))

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.fmap.nearest import SurfaceSearch
-from torchqm.geometry.check import MeshReport, inspect_mesh, orient_faces
+from torchqm.geometry.check import MeshReport, clean_faces, inspect_mesh, orient_faces
 from torchqm.geometry.laplacian import laplacian
 from torchqm.geometry.mesh import Mesh
 from torchqm.geometry.sampling import area_samples
@@ -113,7 +113,7 @@ def prepare(
 
 def _outward(mesh: Mesh, report: MeshReport) -> tuple[Mesh, bool, list[str]]:
     """Unit-area mesh with cleaned, consistently oriented triangles, normals outward where that has a meaning."""
-    faces = orient_faces(mesh)
+    faces = clean_faces(mesh) if report.oriented else orient_faces(mesh)
     if faces is None:
         return mesh.normalized(), False, ["the surface is not orientable"]
     turned = replace(mesh, faces=faces).normalized()
