@@ -59,9 +59,10 @@ def fmap_to_p2p(
     """
     if fmap_xy.shape != (basis_y.k, basis_x.k):
         raise ValueError(f"fmap_xy: expected shape ({basis_y.k}, {basis_x.k}), got {tuple(fmap_xy.shape)}")
-    images = deltas(basis_x, time) @ fmap_xy.T
-    if search is not None:
+    if search is not None:  # in single precision, as the search itself
+        images = deltas(basis_x, time).float() @ fmap_xy.T.float()
         return search.nearest(images, deltas(basis_y, time), guide)
+    images = deltas(basis_x, time) @ fmap_xy.T
     return nearest_used(images, basis_y, time)
 
 

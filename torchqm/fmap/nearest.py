@@ -14,6 +14,7 @@ from torchqm.fmap.threads import in_parallel, workers
 __all__ = ["SurfaceSearch", "nearest_rows"]
 
 _SMALL = 200_000  # distance entries below which one dense product is as quick as a blocked one
+_GROUPS = 16  # anchors of a block in the second stage of a search on a surface
 _ROWS, _COLUMNS = 256, 8192  # of a block of distances: 8 MiB for each worker, whatever the number of points
 
 
@@ -151,15 +152,39 @@ class SurfaceSearch:
             at_anchors = torch.from_numpy(queries32[guide.anchors.numpy()])
             partners = nearest_rows(at_anchors, torch.from_numpy(anchor_points)).numpy()[guide.close.numpy()]
             stage = partners[np.arange(len(partners)), _closest(queries32, anchor_points, partners)]
-        around = self.around.numpy()
-        half = (points32**2).sum(1) / 2
-        out = np.empty(len(queries32), dtype=np.int64)
-        order = np.argsort(stage, kind="stable")
-        anchors, starts = np.unique(stage[order], return_index=True)
-        for anchor, mine in zip(anchors, np.split(order, starts)[1:], strict=True):
-            near = around[anchor]
-            out[mine] = near[(queries32[mine] @ points32[near].T - half[near]).argmax(1)]
-        return torch.from_numpy(out)
+        return torch.from_numpy(_around(queries32, points32, stage, self.around.numpy()))
+
+
+def _around(
+    queries: Shaped[np.ndarray, "Q K"],
+    points: Shaped[np.ndarray, "V K"],
+    stage: Shaped[np.ndarray, " Q"],
+    around: Shaped[np.ndarray, "A m"],
+) -> Shaped[np.ndarray, " Q"]:
+    """For each query the nearest of the points around its anchor."""
+    half = (points**2).sum(1) / 2
+    out = np.empty(len(queries), dtype=np.int64)
+    order = np.argsort(stage, kind="stable")
+    anchors, starts, counts = np.unique(stage[order], return_index=True, return_counts=True)
+    by_size = np.argsort(counts, kind="stable")  # anchors with about as many queries make one product
+
+    def search(groups: np.ndarray) -> None:
+        near = around[anchors[groups]]
+        most = int(counts[groups].max())
+        # The last query of a smaller group is repeated.
+        places = starts[groups, None] + np.minimum(np.arange(most), counts[groups, None] - 1)
+        mine = order[places]
+        products = queries[mine] @ points[near].transpose(0, 2, 1) - half[near][:, None]
+        out[mine] = np.take_along_axis(near, products.argmax(2), 1)
+
+    def search_all(some: list[np.ndarray]) -> None:
+        for groups in some:
+            search(groups)
+
+    blocks = [by_size[i : i + _GROUPS] for i in range(0, len(by_size), _GROUPS)]
+    n = workers()
+    in_parallel([partial(search_all, blocks[number::n]) for number in range(n)])
+    return out
 
 
 def _closest(queries: np.ndarray, points: np.ndarray, candidates: np.ndarray) -> np.ndarray:
