@@ -1,12 +1,14 @@
 """The ways from the first even block to the full map, and the choice between what they give."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchqm.fmap.refine import nearest_isometry
+from torchqm.fmap.threads import in_parallel
 from torchqm.fmap.two_way import Places, growing_pairs, two_way_upsample
 from torchqm.matching.initial import basis_size
 from torchqm.matching.known import KnownSymmetry
@@ -82,23 +84,29 @@ def full_map_from_blocks(
     places = pair_places(x, y, parameters) if parameters.refinement == "upsample" else None
     if places is not None and min(parameters.k_quotient, parameters.k_max) > parameters.k:
         even_blocks.append(sharpened(first, x, y, known_x, known_y, parameters, places))
-    found: list[FullMap] = []
-    for block in even_blocks:
+    weights = None if places is None else sample_weights(x, known_x)
+
+    def maps_of(block: QuotientMatch) -> tuple[FullMap, FullMap | None]:
         odd = solve_odd(
             x.mesh, y.mesh, block.source.even, block.target.even, block.fmap, block.source.odd, block.target.odd
         )
-        fmap = join_blocks(block.source, block.target, block.fmap, odd.fmap)
-        found.append(FullMap(fmap, block, odd, ()))
-    if places is not None:
-        weights = sample_weights(x, known_x)
-        more = [_synchronized(one, x, y, known_x, known_y, weights) for one in found]
-        found += [one for one in more if one is not None]
+        one = FullMap(join_blocks(block.source, block.target, block.fmap, odd.fmap), block, odd, ())
+        return one, None if weights is None else _synchronized(one, x, y, known_x, known_y, weights)
+
+    both = in_parallel([partial(maps_of, block) for block in even_blocks])
+    found = [one for one, _ in both] + [more for _, more in both if more is not None]
     if places is None or len(found) == 1:
         return replace(found[0], fmap=refine_fmap(found[0].fmap, x, y, parameters, places))
     few = places[0].fewer(1000, 3000), places[1].fewer(1000, 3000)
     smaller = parameters.changed(k_max=max(parameters.k, min(K_CHOICE, parameters.k_max)))
-    found = [replace(f, fmap=refine_fmap(f.fmap, x, y, smaller, few)) for f in found]
-    scores = tuple(_score(f.fmap, x, y) for f in found)
+
+    def grown(fmap: Tensor) -> tuple[Tensor, float]:
+        larger = refine_fmap(fmap, x, y, smaller, few)
+        return larger, _score(larger, x, y)
+
+    pairs = in_parallel([partial(grown, f.fmap) for f in found])
+    found = [replace(f, fmap=larger) for f, (larger, _) in zip(found, pairs, strict=True)]
+    scores = tuple(score for _, score in pairs)
     best = found[min(range(len(found)), key=lambda i: scores[i] / (CLEARLY if found[i].synchronized else 1))]
     return replace(best, fmap=refine_fmap(best.fmap, x, y, parameters, places), scores=scores)
 

@@ -1,12 +1,14 @@
 """The descriptors that two shapes share, as coefficients: computed once a pair, whoever asks."""
 
 from dataclasses import dataclass, field
+from functools import partial
 from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchqm.fmap.threads import in_parallel
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.basis import SpectralBasis
@@ -97,12 +99,10 @@ def _computed(
         scale = wave_energies(bases, parameters.n_descriptors)
     else:
         scale = heat_times(bases, parameters.n_descriptors)
-    values = [_signatures(b, scale) for b in bases]
+    values = in_parallel([partial(_signatures, b, scale) for b in bases])
     splitting = Splitting.of(values, parameters.splits)
-    first, second = (
-        splitting.coefficients(v, s.basis.evecs[:, :k] * s.basis.mass[:, None])
-        for v, s in zip(values, (x, y), strict=True)
-    )
+    weights = [s.basis.evecs[:, :k] * s.basis.mass[:, None] for s in (x, y)]
+    first, second = in_parallel([partial(splitting.coefficients, v, w) for v, w in zip(values, weights, strict=True)])
     return PairDescriptors((first, second), splitting, scale, n_functions)
 
 

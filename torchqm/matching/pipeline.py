@@ -1,12 +1,14 @@
 """From two meshes to all the equally good dense maps, and the same for a collection of poses (paper, section 6.2)."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchqm.fmap.threads import in_parallel, one_thread, workers
 from torchqm.geometry.check import check_mesh
 from torchqm.geometry.io import load_mesh
 from torchqm.geometry.mesh import Mesh
@@ -253,6 +255,17 @@ class Collection:
             self._symmetries[key] = (shape, known)
         return self._symmetries[key][1]
 
+    def _planes(self, *shapes: PreparedShape) -> None:
+        """The mirror planes of several shapes at the same time, where there are workers."""
+        new = [s for s in dict.fromkeys(shapes) if (id(s), "extrinsic") not in self._symmetries]
+        if len(new) < 2 or workers() < 2:
+            return
+        known: list[KnownSymmetry] = []
+        for number, shape in enumerate(new):
+            with self.steps(f"mirror plane of {shape.mesh.name}", COST["plane"] * shape.n_verts / 1000):
+                known = known or in_parallel([partial(extrinsic_symmetry, s) for s in new])
+            self._symmetries[(id(shape), "extrinsic")] = (shape, known[number])
+
     def _larger(self, shape: PreparedShape, known: KnownSymmetry) -> KnownSymmetry:
         """The group that the spectrum shows, if it is larger: a pose may have kept a few of many mirror planes.
 
@@ -296,8 +309,11 @@ class Collection:
             *meshes, symmetries=not isinstance(symmetry, str) or symmetry != "none"
         )
         x, y = (self.shape(m) for m in meshes)
-        known_x, known_y = self._both(x, y, symmetry, symmetry_source)
-        result = match_prepared(x, y, known_x, known_y, self.method, self.parameters, self.steps)
+        if self._reference is not None and not (isinstance(symmetry, str) and symmetry == "none"):
+            self.shape(self._reference)  # eigenpairs use all threads
+        with one_thread():
+            known_x, known_y = self._both(x, y, symmetry, symmetry_source)
+            result = match_prepared(x, y, known_x, known_y, self.method, self.parameters, self.steps)
         return replace(result, seconds=self.steps.since(earlier))
 
     def _both(
@@ -319,6 +335,8 @@ class Collection:
         if how not in SYMMETRIES:
             raise ValueError(f"symmetry={how!r}: allowed are {', '.join(SYMMETRIES)} or a table of vertex maps")
         first = "extrinsic" if how == "auto" else how
+        if first == "extrinsic" and isinstance(symmetry, str) and symmetry_source is None and self._reference is None:
+            self._planes(y, x)
         known_y = given_symmetry(y, symmetry) if isinstance(symmetry, Tensor) else self.symmetry(y, first)
         if known_x is None and (isinstance(symmetry, str) or self.method != "semi"):
             known_x = self.symmetry(x, first)

@@ -1,11 +1,13 @@
 """From two prepared shapes and their symmetries to the dense maps between them, with labels and scores."""
 
+from functools import partial
 from typing import Any
 
 import torch
 
 from torchqm.fmap.convert import p2p_to_fmap
 from torchqm.fmap.refine import correspondence_fmap
+from torchqm.fmap.threads import in_parallel
 from torchqm.matching.candidates import full_map_from_blocks
 from torchqm.matching.initial import basis_size
 from torchqm.matching.known import KnownSymmetry, no_symmetry
@@ -21,7 +23,7 @@ from torchqm.matching.quotient import (
 )
 from torchqm.matching.result import MatchResult
 from torchqm.matching.semi_quotient import match_semi_quotient
-from torchqm.matching.shape import PreparedShape
+from torchqm.matching.shape import PreparedShape, complete
 from torchqm.matching.steps import Steps
 from torchqm.matching.subgroups import common_symmetry, one_reflection
 from torchqm.symmetry.orientation import orientation_cosine, orientation_tensor
@@ -67,16 +69,19 @@ def match_prepared(
     if not known_x.known:
         warnings.append("no symmetry is used: of several equally good maps one comes back, possibly a mixture of them")
     work = x.n_verts / 1000
+    curved = parameters.local_weight > 0
     oriented = x.oriented and y.oriented
     separated = None
     if method == "semi":
         with steps("semi-quotient matching", COST["quotient"] * work):
+            complete((x, y), False)
             semi = match_semi_quotient(x, y, known_y.group, parameters)
             even, p2p, fmap = semi.even, semi.orbit_map, None
             if known_y.known:
                 p2p = choose_halves(p2p, known_y.group, known_x.sign, known_y.sign)
     else:
         with steps("quotient matching", COST["quotient"] * work):
+            complete((x, y), curved)
             one = known_x.group.order == 1 or (known_x.reflection and known_y.reflection)
             k_used = None if one else quotient_size(known_x.group.order, parameters)
             found = match_quotient(x, y, known_x.group, known_y.group, parameters, k_used)
@@ -109,7 +114,7 @@ def match_prepared(
         if fmap is None:
             fmap = correspondence_fmap(p2p, x.basis.truncate(k), y.basis.truncate(k), x.samples)
         maps = known_y.group.maps[:, p2p]
-        agreement = [orientation_agreement(x.mesh, y.mesh, m) for m in maps]
+        agreement = in_parallel([partial(orientation_agreement, x.mesh, y.mesh, m) for m in maps])
         basis_y = y.basis.truncate(fmap.shape[0])
         # Row 0 is the identity.
         fmaps = torch.stack([fmap, *(p2p_to_fmap(m, basis_y, basis_y) @ fmap for m in known_y.group.maps[1:])])
@@ -135,7 +140,8 @@ def match_prepared(
             )
         other = {"direct": "mirrored", "mirrored": "direct", "unknown": "unknown"}[label]
         labels = [label if orientation > 0 else other for orientation in known_y.orientation.tolist()]
-        scores = torch.tensor([commutativity_score(m, x.basis, y.basis) for m in maps], dtype=torch.float64)
+        found_scores = in_parallel([partial(commutativity_score, m, x.basis, y.basis) for m in maps])
+        scores = torch.tensor(found_scores, dtype=torch.float64)
         if float(scores.min()) > POOR_SCORE:
             warnings.append(
                 f"no map is near an isometry (best score {float(scores.min()):.2f}, 0 is exact, {POOR_SCORE} is poor): "

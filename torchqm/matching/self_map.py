@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -10,6 +11,7 @@ from torch import Tensor
 from torchqm.fmap.convert import nearest_used, p2p_to_fmap
 from torchqm.fmap.refine import growing_sizes, nearest_isometry, quotient_icp, upsample
 from torchqm.fmap.solve import solve_fmap
+from torchqm.fmap.threads import in_parallel
 from torchqm.fmap.two_way import Places, growing_pairs, two_way_upsample
 from torchqm.matching.described import PairDescriptors, pair_descriptors
 from torchqm.matching.initial import basis_size, unit_columns_pair
@@ -84,14 +86,15 @@ def self_maps_from_halves(
         even, odd = described.coefficients[0][: basis.k], described.weighted(x, basis.k, sign)
     f, g = unit_columns_pair(torch.cat([even, odd], 1), torch.cat([even, -odd], 1))
     samples, among = x.samples[: parameters.n_samples], basis.restricted(x.anchors)
-    found: list[Tensor] = []
-    for weight in parameters.self_commutativity:
+
+    def solved(weight: float) -> Tensor:
         fmap = solve_fmap(f, g, basis.evals, basis.evals, weight * f.shape[1] / basis.k, ridge=1e-9)
         fmap = quotient_icp(
             fmap, basis, among, samples, parameters.icp_steps, parameters.time, tolerance=parameters.icp_tolerance
         )
-        found.append(fmap if parameters.refinement == "icp" else nearest_involution(fmap))
-    return found
+        return fmap if parameters.refinement == "icp" else nearest_involution(fmap)
+
+    return in_parallel([partial(solved, weight) for weight in parameters.self_commutativity])
 
 
 def conjugate_reflection(
@@ -129,11 +132,14 @@ def best_self_map(
     if not candidates:
         raise ValueError("candidates: there must be at least one")
     k = min(K_CHOICE, parameters.k_max, x.basis.k)
-    grown: list[Tensor] = []
+    alike: list[int] = []  # for each candidate the first one that is nearly the same, and grows for both
     for number, candidate in enumerate(candidates):
         twins = [j for j in range(number) if candidates[j].shape == candidate.shape]
         near = [j for j in twins if float((candidates[j] - candidate).norm()) < 0.05 * float(candidate.norm())]
-        grown.append(grown[near[0]] if near else grow_self_map(candidate, x, parameters, k))
+        alike.append(alike[near[0]] if near else number)
+    different = sorted(set(alike))
+    results = in_parallel([partial(grow_self_map, candidates[j], x, parameters, k) for j in different])
+    grown = [results[different.index(j)] for j in alike]
     scores = [reflection_score(fmap, x) for fmap in grown]
     if witness is not None:
         images = [_images(fmap, x, parameters) for fmap in grown]
