@@ -27,6 +27,7 @@ from torchqm.matching.result import MatchResult, SymmetryResult
 from torchqm.matching.shape import N_ANCHORS, PreparedShape, prepare
 from torchqm.matching.steps import StepListener, Steps
 from torchqm.matching.subgroups import first_reflection
+from torchqm.spectral.cache import is_cached
 
 __all__ = ["METHODS", "SYMMETRIES", "Collection", "detect_symmetry", "find_symmetry", "match"]
 
@@ -207,10 +208,26 @@ class Collection:
         mesh = self.load(mesh)
         if id(mesh) not in self._shapes:
             with self.steps(f"eigenpairs of {mesh.name}", COST["eigenpairs"] * mesh.n_verts / 1000):
-                p = self.parameters
-                prepared = prepare(mesh, p.k_max, max(p.n_samples, N_ANCHORS), p.seed, cache_dir=self.cache_dir)
+                prepared = self._prepared(mesh)
             self._shapes[id(mesh)] = (mesh, prepared)  # the mesh is kept so that its id stays its own
         return self._shapes[id(mesh)][1]
+
+    def _prepared(self, mesh: Mesh) -> PreparedShape:
+        p = self.parameters
+        return prepare(mesh, p.k_max, max(p.n_samples, N_ANCHORS), p.seed, cache_dir=self.cache_dir)
+
+    def _read(self, *meshes: Mesh | PreparedShape) -> None:
+        """Make several meshes ready at the same time, if their eigenpairs are only read from the cache."""
+        new = [m for m in dict.fromkeys(meshes) if isinstance(m, Mesh) and id(m) not in self._shapes]
+        if len(new) < 2 or not all(is_cached(m, self.parameters.k_max, cache_dir=self.cache_dir) for m in new):
+            return
+        prepared: list[PreparedShape] = []
+        for number, mesh in enumerate(new):
+            with self.steps(f"eigenpairs of {mesh.name}", COST["eigenpairs"] * mesh.n_verts / 1000):
+                if not prepared:
+                    with one_thread():
+                        prepared = in_parallel([partial(self._prepared, m) for m in new])
+            self._shapes[id(mesh)] = (mesh, prepared[number])
 
     def symmetry(self, shape: PreparedShape, how: str = "extrinsic") -> KnownSymmetry:
         """The shape's symmetry: from the reference if there is one, else from itself.
@@ -308,6 +325,7 @@ class Collection:
         self.steps.total = self.steps.done + self.expected_work(
             *meshes, symmetries=not isinstance(symmetry, str) or symmetry != "none"
         )
+        self._read(*meshes)
         x, y = (self.shape(m) for m in meshes)
         if self._reference is not None and not (isinstance(symmetry, str) and symmetry == "none"):
             self.shape(self._reference)  # eigenpairs use all threads
