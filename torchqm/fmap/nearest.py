@@ -151,7 +151,10 @@ class SurfaceSearch:
                 raise ValueError(f"guide: has {guide.close.shape[0]} vertices, but there are {len(queries32)} queries")
             at_anchors = torch.from_numpy(queries32[guide.anchors.numpy()])
             partners = nearest_rows(at_anchors, torch.from_numpy(anchor_points)).numpy()[guide.close.numpy()]
-            stage = partners[np.arange(len(partners)), _closest(queries32, anchor_points, partners)]
+            size = max(1, -(-len(partners) // workers()))
+            some = [slice(i, i + size) for i in range(0, len(partners), size)]
+            tasks = [partial(_closest, queries32[rows], anchor_points, partners[rows]) for rows in some]
+            stage = partners[np.arange(len(partners)), np.concatenate(in_parallel(tasks))]
         return torch.from_numpy(_around(queries32, points32, stage, self.around.numpy()))
 
 

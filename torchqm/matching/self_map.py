@@ -138,11 +138,16 @@ def best_self_map(
         near = [j for j in twins if float((candidates[j] - candidate).norm()) < 0.05 * float(candidate.norm())]
         alike.append(alike[near[0]] if near else number)
     different = sorted(set(alike))
-    results = in_parallel([partial(grow_self_map, candidates[j], x, parameters, k) for j in different])
-    grown = [results[different.index(j)] for j in alike]
+
+    def grow(number: int) -> tuple[Tensor, Tensor | None]:
+        fmap = grow_self_map(candidates[number], x, parameters, k)
+        return fmap, None if witness is None else _images(fmap, x, parameters)
+
+    results = dict(zip(different, in_parallel([partial(grow, j) for j in different]), strict=True))
+    grown = [results[j][0] for j in alike]
     scores = [reflection_score(fmap, x) for fmap in grown]
     if witness is not None:
-        images = [_images(fmap, x, parameters) for fmap in grown]
+        images = [image for j in alike if (image := results[j][1]) is not None]
         gaps = [float((image - images[witness]).norm(dim=1).mean()) for image in images]
         scores = [score + 0.3 * gap for score, gap in zip(scores, gaps, strict=True)]
     chosen = scores.index(min(scores))

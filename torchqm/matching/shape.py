@@ -126,7 +126,9 @@ def prepare(
     problems: tuple[str, ...] = ()
     if basis is None and cache_folder(cache_dir) is not None:
         kept = cached_basis(mesh, k, kind, cache_dir, whole_clusters=False, warn=False)
-        basis, problems = kept.scaled(mesh.area**-0.5), kept.report.problems
+        scale = mesh.area**-0.5  # SpectralBasis.scaled, in place: nobody else has this array
+        basis = SpectralBasis(kept.evals / scale**2, kept.evecs.div_(scale), kept.mass * scale**2)
+        problems = kept.report.problems
         origin = f"{kept.report.source}{', from the cache' if kept.report.outcome == 'read' else ''}"
         operator = f"{kept.report.kind}: {kept.report.reason}; eigenpairs: {origin}"
     else:
