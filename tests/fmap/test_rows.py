@@ -1,5 +1,8 @@
 """torchqm.fmap.rows: against dense solves, derivatives of all orders, under torch.func, and what is kept in memory."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 from references.unchecked import unchecked

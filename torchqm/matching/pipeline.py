@@ -259,29 +259,27 @@ class Collection:
         """The symmetry that a shape itself shows, by its mirror planes or its spectrum; a reference is not asked."""
         key = (id(shape), how)
         if key not in self._symmetries:
-            cost = shape.n_verts / 1000
-            if how == "detect":
-                # Only now is it known that this is needed; what is left grows by it.
-                work = DETECTION + COST["detect"] * cost
-                self.steps.total += work
-                with self.steps(f"symmetry of {shape.mesh.name} from its spectrum", work):
-                    known = detected_symmetry(shape, self.parameters)
-            else:
-                with self.steps(f"mirror plane of {shape.mesh.name}", COST["plane"] * cost):
-                    known = extrinsic_symmetry(shape)
-            self._symmetries[key] = (shape, known)
+            self._find_own(how, shape)
         return self._symmetries[key][1]
 
-    def _planes(self, *shapes: PreparedShape) -> None:
-        """The mirror planes of several shapes at the same time, where there are workers."""
-        new = [s for s in dict.fromkeys(shapes) if (id(s), "extrinsic") not in self._symmetries]
-        if len(new) < 2 or workers() < 2:
-            return
-        known: list[KnownSymmetry] = []
-        for number, shape in enumerate(new):
-            with self.steps(f"mirror plane of {shape.mesh.name}", COST["plane"] * shape.n_verts / 1000):
-                known = known or in_parallel([partial(extrinsic_symmetry, s) for s in new])
-            self._symmetries[(id(shape), "extrinsic")] = (shape, known[number])
+    def _find_own(self, how: str, *shapes: PreparedShape) -> None:
+        """:meth:`own_symmetry` of several shapes, at the same time where there are workers."""
+        new = [s for s in dict.fromkeys(shapes) if (id(s), how) not in self._symmetries]
+        at_once = len(new) if workers() > 1 else 1
+        for start in range(0, len(new), at_once):
+            part, known = new[start : start + at_once], list[KnownSymmetry]()
+            for number, shape in enumerate(part):
+                name, cost = f"mirror plane of {shape.mesh.name}", COST["plane"] * shape.n_verts / 1000
+                if how == "detect":
+                    name = f"symmetry of {shape.mesh.name} from its spectrum"
+                    cost = DETECTION + COST["detect"] * shape.n_verts / 1000
+                    self.steps.total += cost  # only now is it known that this is needed: what is left grows by it
+                with self.steps(name, cost):  # the first step is that of all
+                    known = known or in_parallel([partial(self._own, how, s) for s in part])
+                self._symmetries[(id(shape), how)] = (shape, known[number])
+
+    def _own(self, how: str, shape: PreparedShape) -> KnownSymmetry:
+        return detected_symmetry(shape, self.parameters) if how == "detect" else extrinsic_symmetry(shape)
 
     def _larger(self, shape: PreparedShape, known: KnownSymmetry) -> KnownSymmetry:
         """The group that the spectrum shows, if it is larger: a pose may have kept a few of many mirror planes.
@@ -354,13 +352,16 @@ class Collection:
             raise ValueError(f"symmetry={how!r}: allowed are {', '.join(SYMMETRIES)} or a table of vertex maps")
         first = "extrinsic" if how == "auto" else how
         if first == "extrinsic" and isinstance(symmetry, str) and symmetry_source is None and self._reference is None:
-            self._planes(y, x)
+            self._find_own("extrinsic", y, x)
         known_y = given_symmetry(y, symmetry) if isinstance(symmetry, Tensor) else self.symmetry(y, first)
         if known_x is None and (isinstance(symmetry, str) or self.method != "semi"):
             known_x = self.symmetry(x, first)
         if how == "auto" and known_x is not None and not (known_x.firm or known_y.firm):
             # Nothing to rely on; a transfer from a shape with a firm plane would be quicker, and as good.
-            known_x = self.symmetry(x, "auto") if symmetry_source is None else known_x
+            if symmetry_source is None:
+                if self._reference is None:
+                    self._find_own("detect", x, y)
+                known_x = self.symmetry(x, "auto")
             known_y = self.symmetry(y, "auto")
         if known_x is None or _gives_way(known_x, known_y):
             known_x = self.transfer(x, y, known_y)
