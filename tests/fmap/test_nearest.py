@@ -8,6 +8,7 @@ from references.unchecked import unchecked
 
 import torchqm.fmap.nearest as module
 from torchqm.fmap import SurfaceSearch, nearest_rows
+from torchqm.fmap.threads import one_thread
 from torchqm.geometry import area_samples
 
 
@@ -15,12 +16,10 @@ def noise(*shape, seed=0):
     return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-@pytest.fixture(params=["product", "blocks", "faiss"])
+@pytest.fixture(params=["product", "blocks"])
 def search(request, monkeypatch):
     if request.param != "product":
         monkeypatch.setattr(module, "_SMALL", 0)
-    if request.param == "faiss":
-        monkeypatch.setattr(module, "_FEW", 0)
     return nearest_rows
 
 
@@ -50,8 +49,7 @@ def test_all_ways_take_any_layout_and_single_precision(search):
 def test_each_way_is_taken(search, request, monkeypatch):
     """Else the other tests would compare one and the same way with itself."""
     taken = []
-    faiss, blocked = module._faiss, module._blocked
-    monkeypatch.setattr(module, "_faiss", lambda: taken.append("faiss") or faiss())
+    blocked = module._blocked
     monkeypatch.setattr(module, "_blocked", lambda *a: taken.append("blocks") or blocked(*a))
     search(noise(20, 4), noise(30, 4))
     wanted = request.node.callspec.params["search"]
@@ -61,9 +59,30 @@ def test_each_way_is_taken(search, request, monkeypatch):
 @pytest.mark.parametrize("q", [1, 63, 64, 65, 200])
 def test_blocks_of_any_size_are_put_together(q):
     queries, points = noise(q, 6), noise(300, 6, seed=1)
-    for rows in (1, 7, 64):
-        found = module._blocked(queries.float().numpy(), points.float().numpy(), rows)
-        assert torch.equal(found, dense.nearest_rows(queries, points))
+    wanted = dense.nearest_rows(queries, points)
+    for rows, columns in ((1, 300), (7, 299), (64, 64), (64, 1), (256, 8192)):
+        found = module._blocked(queries.float().numpy(), points.float().numpy(), rows, columns)
+        assert torch.equal(torch.from_numpy(found), wanted)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 8])
+def test_workers_share_the_queries(n, monkeypatch):
+    """As many ranges as there are workers, and the same answer."""
+    monkeypatch.setattr(module, "_SMALL", 0)
+    queries, points = noise(2000, 6), noise(40, 6, seed=1)
+    ranges = []
+    improve = module._improve
+    monkeypatch.setattr(module, "_improve", lambda q, *rest: ranges.append(len(q)) or improve(q, *rest))
+    before = torch.get_num_threads()
+    torch.set_num_threads(n)
+    try:
+        with one_thread():
+            found = nearest_rows(queries, points)
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(found, dense.nearest_rows(queries, points))
+    assert len(ranges) == min(n, 8)
+    assert sum(ranges) == 2000
 
 
 def test_refusals(search):

@@ -1,5 +1,8 @@
 """torchqm.fmap.rows: against dense solves, derivatives of all orders, under torch.func, and what is kept in memory."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 from references.unchecked import unchecked
@@ -170,3 +173,16 @@ def test_refusals():
         call(gram * torch.nan, d, r)
     with pytest.raises(ValueError, match="lmbda and eigenvalues has entries that are NaN"):
         call(gram, d * torch.inf, r)
+
+
+def test_outside_compiled_code_the_compiler_is_not_loaded_and_the_answer_is_the_operators():
+    """Loading it takes seconds, and every first match in a process had to wait for it."""
+    code = (
+        "import sys, torch; from torchqm.fmap.rows import solve_rows\n"
+        "g, d = torch.eye(2), torch.tensor([[0.0, 3.0], [3.0, 15.0]])\n"
+        "found = solve_rows(g, d, torch.ones(2, 2))\n"
+        "loaded = 'torch._dynamo' in sys.modules\n"
+        "print(loaded, torch.equal(found, torch.ops.torchqm.solve_rows(g, d, torch.ones(2, 2), 0, False, True)[0]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "True"]

@@ -1,10 +1,13 @@
 """torchqm.fmap.threads: one thread inside, what was set before outside, also after an error."""
 
+from functools import partial
+from threading import Barrier, get_ident
+
 import pytest
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from torchqm.fmap.threads import one_thread
+from torchqm.fmap.threads import in_parallel, one_thread, workers
 
 
 @pytest.fixture(autouse=True)
@@ -47,3 +50,35 @@ def test_one_inside_another():
         assert torch.get_num_threads() == 1
         assert set(blas()) == {1}
     assert torch.get_num_threads() == 2
+
+
+def test_threads_before_are_workers_inside():
+    assert workers() == 1
+    with one_thread():
+        assert workers() == 2
+        with one_thread():
+            assert workers() == 2
+    assert workers() == 1
+
+
+def test_tasks_run_at_the_same_time_in_order():
+    """Each waits for the other: one after the other they would never end."""
+    barrier = Barrier(2, timeout=20)
+
+    def task(number):
+        barrier.wait()
+        return number, workers(), torch.get_num_threads()
+
+    with one_thread():
+        assert in_parallel([partial(task, 0), partial(task, 1)]) == [(0, 1, 1), (1, 1, 1)]
+        assert in_parallel([]) == []
+        assert in_parallel([workers]) == [2]  # a single task keeps them all
+
+
+def test_without_workers_one_after_the_other_in_this_thread():
+    assert in_parallel([get_ident, get_ident]) == [get_ident()] * 2
+
+
+def test_an_error_of_a_task_comes_out():
+    with one_thread(), pytest.raises(KeyError, match="second"):
+        in_parallel([lambda: 1, partial({}.__getitem__, "second"), lambda: 3])

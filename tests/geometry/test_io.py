@@ -11,7 +11,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from torchqm.geometry import Mesh, MeshError, load_mesh, save_mesh
+from torchqm.geometry import Mesh, MeshError, formats, load_mesh, save_mesh
 
 VERTS = [[0, 0, 0], [1, 0, 0], [9, 9, 9], [0, 1, 0], [1, 1, 0.5]]  # vertex 2 belongs to no face
 FACES = [[0, 1, 3], [1, 4, 3]]
@@ -353,3 +353,35 @@ def test_where_saving_is_refused(tmp_path):
     with pytest.raises(MeshError, match=r"d\.off: cannot be written \(Is a directory\)"):
         save_mesh(mesh, tmp_path / "d.off")
     assert os.listdir(tmp_path) == ["d.off"]
+
+
+@pytest.mark.parametrize(
+    ("text", "plain"),
+    [
+        (OFF, True),
+        (OFF.rstrip("\n"), True),
+        (OFF.replace("1 1 .5", "-1e-3 +1. 5E-1"), True),
+        (OFF.replace("\n", "\r\n"), False),
+        (OFF.replace("9 9 9", "9 9 9 # far"), False),
+        (OFF.replace("OFF\n", "OFF\n\n"), False),
+        (OFF.replace("OFF\n", "OFF "), False),
+        (OFF.replace("3 0 1 3\n", "4 0 1 4 3\n"), False),
+        (OFF.replace("3 0 1 3", "3 0 1. 3"), False),
+        (OFF.replace("9 9 9", "9 9 9 255"), False),
+        (OFF.replace("9 9 9", "9 9 x"), False),
+        (OFF.replace("9 9 9\n", ""), False),
+        (OFF + "\n", False),
+    ],
+)
+def test_the_quick_way_for_off_reads_what_the_slow_one_reads(tmp_path, text, plain):
+    """It declines all but the usual files; what it takes, it reads the same."""
+    path = write(tmp_path, "a.off", text)
+    found = formats._plain_off(path)
+    assert (found is not None) == plain
+    if found is not None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(formats, "_plain_off", lambda path: None)
+            slow = formats._read_off(path)
+        for quick, wanted in zip(found, slow, strict=True):
+            assert quick.dtype == wanted.dtype
+            assert np.array_equal(quick, wanted)

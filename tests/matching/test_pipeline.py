@@ -693,3 +693,24 @@ def test_seconds_are_those_of_this_match(pair):
     assert not any("eigenpairs" in name for name in again)
     assert 0 < again["quotient matching"] < first["quotient matching"] + again["quotient matching"]
     assert all(spent > 0 for spent in (*first.values(), *again.values()))
+
+
+def test_workers_and_a_cache_change_nothing(tmp_path):
+    """Two shapes looked at, and read, at the same time, on two threads: the same maps, labels and names of steps."""
+    source, target = creature("quadruped", 500, pose=1, retriangulate=1), creature("quadruped", 500, pose=2)
+    before = torch.get_num_threads()
+    results = []
+    for threads, cache in ((1, tmp_path), (2, tmp_path)):
+        torch.set_num_threads(threads)
+        try:
+            results.append(match(source.mesh, target.mesh, parameters=FAST, cache_dir=cache))
+        finally:
+            torch.set_num_threads(before)
+    first, other = results
+    assert torch.equal(other.maps, first.maps)
+    assert torch.equal(other.symmetry_source, first.symmetry_source)
+    assert (other.labels, other.warnings) == (first.labels, first.warnings)
+    assert list(other.seconds) == list(first.seconds)
+    assert first.details["source"]["symmetry"] == "detected"
+    assert "from the cache" not in first.details["source"]["laplacian"]
+    assert "from the cache" in other.details["source"]["laplacian"]

@@ -142,3 +142,11 @@ def test_no_more_points_ask_than_there_are(exact):
     bare = pair_places(exact.x, exact.y, FAST.changed(local_weight=0.0))[0]
     assert bare.features.shape == (642, 0)
     assert pair_places(exact.x, exact.y, FAST.changed(n_samples=50))[1].n_queries == 50
+
+
+def test_orbits_of_some_vertices_are_those_of_an_exhaustive_search(exact, found):
+    ids = exact.x.samples[:50]
+    images = found.source.even.evecs[ids] @ found.fmap.T
+    distances = torch.cdist(images, found.target.even.evecs)
+    mine = found.orbit_map_of(ids)
+    torch.testing.assert_close(distances[torch.arange(50), mine], distances.amin(1), atol=1e-6, rtol=0)

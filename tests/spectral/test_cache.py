@@ -28,6 +28,7 @@ from torchqm.spectral import (
     mesh_basis,
     read_basis,
 )
+from torchqm.spectral.cache import is_cached
 from torchqm.testing import basis_allclose
 
 MESH = blob(1, 2).mesh  # 162 vertices: solved densely, so that an eigen-solve takes milliseconds
@@ -446,3 +447,14 @@ def test_a_holder_that_hangs_is_not_waited_for_without_end(tmp_path, monkeypatch
     with filelock.FileLock(tmp_path / "locks" / f"{cache_file.content_hash(MESH)}-auto.lock"):
         assert same(quietly(MESH, 5, cache_dir=tmp_path), MESH, 5)
     assert len(entries(tmp_path)) == 1
+
+
+def test_is_cached_says_whether_an_entry_would_serve(tmp_path):
+    mesh = blob(2, 2).mesh
+    assert not is_cached(mesh, 8, cache_dir=tmp_path)
+    cached_basis(mesh, 8, cache_dir=tmp_path)
+    assert is_cached(mesh, 8, cache_dir=tmp_path)
+    assert is_cached(mesh, 5, cache_dir=tmp_path)
+    assert not is_cached(mesh, 9, cache_dir=tmp_path)
+    assert not is_cached(blob(4, 2).mesh, 8, cache_dir=tmp_path)
+    assert not is_cached(mesh, 8, "other", tmp_path)

@@ -114,3 +114,16 @@ def test_cosines_of_exact_symmetries(prism):
     other = orientation_tensor(inside_out, basis)
     identity = torch.eye(40, dtype=torch.float64)
     assert orientation_cosine(identity, whole, other) == pytest.approx(-1)
+
+
+def test_blocks_of_triangles_give_what_the_forms_give(mirror_blob):
+    """Against the form of every triangle, spread to its corners; some blocks of triangles, pairs in any order."""
+    mesh, basis = mirror_blob.mesh, basis_of(mirror_blob.mesh, 8)
+    assert mesh.n_faces > 1024
+    pairs = torch.tensor([[7, 1, 3, 3], [2, 5, 3, 1]])
+    form = orientation_form(mesh, basis.evecs, pairs)
+    spread = torch.zeros(mesh.n_verts, 4, dtype=form.dtype)
+    for corner in range(3):
+        spread.index_add_(0, mesh.faces[:, corner], form / 3)
+    found = orientation_coefficients(mesh, basis.evecs, pairs, basis.evecs)
+    torch.testing.assert_close(found, basis.evecs.T @ spread, atol=1e-12, rtol=1e-12)

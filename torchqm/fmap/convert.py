@@ -1,10 +1,13 @@
 """From functional maps to point maps and back (paper, section 4.4)."""
 
+from functools import partial
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.fmap.nearest import SurfaceSearch, nearest_rows
+from torchqm.fmap.threads import in_parallel, workers
 from torchqm.spectral.basis import SpectralBasis
 
 __all__ = ["deltas", "fmap_to_p2p", "nearest_used", "p2p_to_fmap"]
@@ -59,10 +62,17 @@ def fmap_to_p2p(
     """
     if fmap_xy.shape != (basis_y.k, basis_x.k):
         raise ValueError(f"fmap_xy: expected shape ({basis_y.k}, {basis_x.k}), got {tuple(fmap_xy.shape)}")
-    images = deltas(basis_x, time) @ fmap_xy.T
-    if search is not None:
+    if search is not None:  # in single precision, as the search itself
+        rows, single = deltas(basis_x, time), fmap_xy.T.float()
+        parts = rows.split(max(1, -(-len(rows) // workers())))
+        images = torch.cat(in_parallel([partial(_times, part, single) for part in parts]))
         return search.nearest(images, deltas(basis_y, time), guide)
+    images = deltas(basis_x, time) @ fmap_xy.T
     return nearest_used(images, basis_y, time)
+
+
+def _times(rows: Tensor, single: Tensor) -> Tensor:
+    return rows.float() @ single
 
 
 def nearest_used(images: Float[Tensor, "Q Ky"], basis_y: SpectralBasis, time: float = 0.0) -> Int[Tensor, " Q"]:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchqm.checks import Sizes, wanted
+from torchqm.checks import Sizes, enabled, wanted
 from torchqm.fmap.cholesky import factorize, rows_at_once, solve_checked, solve_factored, surely_regular
 from torchqm.fmap.operator import operator
 
@@ -88,11 +88,14 @@ def solve_rows(
         raise ValueError(f"row_chunk is {row_chunk}; allowed are None and whole numbers from 1")
     tracked = gram.requires_grad or diagonal.requires_grad or rhs.requires_grad
     keep = row_chunk is None and tracked and torch.is_grad_enabled()
+    if enabled() and not tracked and all(type(t) is Tensor for t in (gram, diagonal, rhs)):
+        # Nobody compiles, traces or differentiates. Called as an operator for the first time, it would load the
+        # compiler, which takes longer than the match of a pair.
+        return _rows_and_factor(gram, diagonal, rhs, row_chunk or 0, False, True)[0]
     return _Solve.apply(gram, diagonal, rhs, row_chunk or 0, keep, wanted())[0]
 
 
-@operator("solve_rows")
-def _solve_rows(
+def _rows_and_factor(
     gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool, check: bool
 ) -> tuple[Tensor, Tensor]:
     """The rows, and the factor ``(Ky, samples, Kx, Kx)``, empty unless kept; rows first: chunks lie together."""
@@ -126,6 +129,9 @@ def _solve_rows(
                 raise ValueError(f"the system made of the {name} has entries that are NaN or infinite")
         raise UndeterminedRowsError(undetermined.T.reshape(rhs.shape[:-1]))
     return rows.transpose(0, 1).reshape(rhs.shape).contiguous(), factor
+
+
+_solve_rows = operator("solve_rows")(_rows_and_factor)
 
 
 @operator("solve_rows_again")

@@ -45,6 +45,9 @@ The norm of a triangle's normal needs fourth powers of lengths: between these, a
 mesh in size, they stay within double precision (1e-308 to 1e308) whether or not a step scales the mesh first."""
 
 
+_REPORT = "_report"  # where a mesh keeps its report, beside its cached properties
+
+
 class MeshError(ValueError):
     """A mesh that cannot be used; the message names the file (or the mesh) and the fault."""
 
@@ -260,11 +263,20 @@ def inspect_mesh(mesh: Mesh) -> MeshReport:
     Raises:
         MeshError: what :func:`check_arrays` raises, or coordinates whose difference is no double any more.
 
+    The report stays with the mesh, as its areas do: whoever asks again gets the same one.
+
     Example:
         >>> report = inspect_mesh(Mesh.from_arrays(np.eye(3), [[0, 1, 2]]))
         >>> report.n_boundary_edges, report.euler, report.oriented
         (3, 1, True)
     """
+    kept = mesh.__dict__.get(_REPORT)
+    if kept is None:
+        kept = mesh.__dict__[_REPORT] = _inspect(mesh)
+    return kept
+
+
+def _inspect(mesh: Mesh) -> MeshReport:
     verts, given = mesh.numpy()
     check_arrays(verts, given, mesh.label)
     distinct, first = face_masks(given)

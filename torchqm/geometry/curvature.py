@@ -2,9 +2,10 @@
 
 import torch
 from jaxtyping import Float
+from scipy.sparse import csr_array
 from torch import Tensor
 
-from torchqm.geometry.laplacian import cotan_stiffness
+from torchqm.geometry.laplacian import cotan_stiffness, to_scipy
 from torchqm.geometry.mesh import Mesh
 
 __all__ = ["mean_curvature", "vertex_normals"]
@@ -18,7 +19,7 @@ def vertex_normals(mesh: Mesh) -> Float[Tensor, "V 3"]:
     return torch.nn.functional.normalize(sums, dim=1, eps=1e-300)
 
 
-def mean_curvature(mesh: Mesh) -> Float[Tensor, " V"]:
+def mean_curvature(mesh: Mesh, stiffness: csr_array | None = None) -> Float[Tensor, " V"]:
     """``H = n . (Delta x) / 2`` with the cotangent Laplacian (positive semidefinite); unit 1 / length.
 
     Positive where the surface is convex, if its normals point outward; a sphere of radius r has 1 / r. At single
@@ -27,11 +28,14 @@ def mean_curvature(mesh: Mesh) -> Float[Tensor, " V"]:
 
     Args:
         mesh: consistently oriented, or the sign means nothing.
+        stiffness: cotangent matrix of the mesh, if it is there already.
 
     References:
         Meyer et al. 2003, section 3.
     """
     areas = mesh.vertex_areas
-    laplacian = (cotan_stiffness(mesh.verts, mesh.faces) @ mesh.verts) / areas.clamp_min(1e-300)[:, None]
+    if stiffness is None:
+        stiffness = to_scipy(cotan_stiffness(mesh.verts, mesh.faces))
+    laplacian = torch.from_numpy(stiffness @ mesh.verts.numpy()) / areas.clamp_min(1e-300)[:, None]
     values = (laplacian * vertex_normals(mesh)).sum(1) / 2
     return torch.where((areas > 0) & torch.isfinite(values), values, 0.0)

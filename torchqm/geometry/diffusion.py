@@ -12,7 +12,13 @@ from torchqm.geometry.mesh import Mesh
 __all__ = ["diffused"]
 
 
-def diffused(mesh: Mesh, values: Float[Tensor, "V C"], time: float, rtol: float = 1e-4) -> Float[Tensor, "V C"]:
+def diffused(
+    mesh: Mesh,
+    values: Float[Tensor, "V C"],
+    time: float,
+    rtol: float = 1e-4,
+    stiffness: "scipy.sparse.csr_array | None" = None,
+) -> Float[Tensor, "V C"]:
     """``u = (M + t W)^-1 M f``: a function of frequency lambda is damped by ``1 / (1 + t lambda)``.
 
     Solved by conjugate gradients, which need few steps for short times: no factorisation, and no eigenfunctions, which
@@ -23,6 +29,7 @@ def diffused(mesh: Mesh, values: Float[Tensor, "V C"], time: float, rtol: float 
         values: ``(V, C)`` functions f; at vertices without area they stay as they are.
         time: t, in squared units of the mesh.
         rtol: relative residual at which the iteration stops.
+        stiffness: cotangent matrix W of the mesh, if it is there already.
 
     Raises:
         ValueError: a negative time.
@@ -38,9 +45,9 @@ def diffused(mesh: Mesh, values: Float[Tensor, "V C"], time: float, rtol: float 
         raise ValueError(f"time={time}: must not be negative")
     mass = mesh.vertex_areas.numpy()
     there = mass > 0
-    matrix = (
-        scipy.sparse.diags_array(np.where(there, mass, 1.0)) + time * to_scipy(cotan_stiffness(mesh.verts, mesh.faces))
-    ).tocsr()
+    if stiffness is None:
+        stiffness = to_scipy(cotan_stiffness(mesh.verts, mesh.faces))
+    matrix = (scipy.sparse.diags_array(np.where(there, mass, 1.0)) + time * stiffness).tocsr()
     inverse = 1 / matrix.diagonal()
     scaling = scipy.sparse.linalg.LinearOperator(matrix.shape, matvec=lambda v: inverse * v, dtype=np.float64)
     columns = []

@@ -76,14 +76,14 @@ class _Lines:
         return table.astype(np.int64)
 
 
-def numbers(text: str) -> np.ndarray | None:
+def numbers(text: str, kind: type = np.float64) -> np.ndarray | None:
     """All numbers of a text, or None if something in it is none."""
     if not text:
-        return np.zeros(0)
+        return np.zeros(0, dtype=kind)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)  # numpy's way of saying that it stopped early
-            return np.fromstring(text, sep=" ")
+            return np.fromstring(text, dtype=kind, sep=" ")
     except (DeprecationWarning, ValueError):
         return None
 
@@ -94,7 +94,36 @@ def _fans(polygons: list[list[int]]) -> np.ndarray:
     return np.array(fans, dtype=np.int64).reshape(-1, 3)
 
 
+def _plain_off(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """The usual OFF file, without a list of its lines; None if anything is unusual, right or wrong.
+
+    ``OFF``, the counts, then one vertex or triangle a line, nothing between them or after them.
+    """
+    raw = path.read_bytes()
+    if not raw.startswith(b"OFF\n") or b"#" in raw or b"\r" in raw:
+        return None
+    ends = np.flatnonzero(np.frombuffer(raw, dtype=np.uint8) == ord("\n"))
+    if not raw.endswith(b"\n"):
+        ends = np.append(ends, len(raw))
+    counts = numbers(raw[4 : ends[1]].decode("ascii", errors="replace")) if len(ends) > 2 else None
+    if counts is None or len(counts) != 3 or (counts < 0).any() or (counts % 1 != 0).any():
+        return None
+    n_verts, n_faces = int(counts[0]), int(counts[1])
+    if min(n_verts, n_faces) == 0 or len(ends) != 2 + n_verts + n_faces or (np.diff(ends) < 6).any():
+        return None  # "0 0 0" is the shortest line
+    middle = int(ends[1 + n_verts])
+    verts = numbers(raw[ends[1] + 1 : middle].decode("ascii", errors="replace"))
+    faces = numbers(raw[middle + 1 :].decode("ascii", errors="replace"), np.int64)
+    if verts is None or faces is None or len(verts) != 3 * n_verts or len(faces) != 4 * n_faces:
+        return None
+    table = faces.reshape(-1, 4)
+    return (verts.reshape(-1, 3), np.ascontiguousarray(table[:, 1:])) if (table[:, 0] == 3).all() else None
+
+
 def _read_off(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    plain = _plain_off(path)
+    if plain is not None:
+        return plain
     text = _Lines(path)
     header = _OFF_HEADER.match(text.lines[0])
     if header is None:

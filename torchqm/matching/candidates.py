@@ -1,12 +1,14 @@
 """The ways from the first even block to the full map, and the choice between what they give."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchqm.fmap.refine import nearest_isometry
+from torchqm.fmap.threads import in_parallel
 from torchqm.fmap.two_way import Places, growing_pairs, two_way_upsample
 from torchqm.matching.initial import basis_size
 from torchqm.matching.known import KnownSymmetry
@@ -15,7 +17,7 @@ from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.quality import commutator_norm, distance_change
 from torchqm.matching.quotient import QuotientMatch, pair_places, refine_fmap
 from torchqm.matching.shape import PreparedShape
-from torchqm.matching.synchronize import synchronized_halves
+from torchqm.matching.synchronize import sample_weights, synchronized_halves
 from torchqm.symmetry.basis import SymmetrizedBasis, symmetrized_basis
 
 __all__ = ["FullMap", "full_map_from_blocks", "sharpened"]
@@ -82,21 +84,29 @@ def full_map_from_blocks(
     places = pair_places(x, y, parameters) if parameters.refinement == "upsample" else None
     if places is not None and min(parameters.k_quotient, parameters.k_max) > parameters.k:
         even_blocks.append(sharpened(first, x, y, known_x, known_y, parameters, places))
-    found: list[FullMap] = []
-    for block in even_blocks:
+    weights = None if places is None else sample_weights(x, known_x)
+
+    def maps_of(block: QuotientMatch) -> tuple[FullMap, FullMap | None]:
         odd = solve_odd(
             x.mesh, y.mesh, block.source.even, block.target.even, block.fmap, block.source.odd, block.target.odd
         )
-        fmap = join_blocks(block.source, block.target, block.fmap, odd.fmap)
-        found.append(FullMap(fmap, block, odd, ()))
-    if places is not None:
-        found += [more for one in found if (more := _synchronized(one, x, y, known_x, known_y)) is not None]
+        one = FullMap(join_blocks(block.source, block.target, block.fmap, odd.fmap), block, odd, ())
+        return one, None if weights is None else _synchronized(one, x, y, known_x, known_y, weights)
+
+    both = in_parallel([partial(maps_of, block) for block in even_blocks])
+    found = [one for one, _ in both] + [more for _, more in both if more is not None]
     if places is None or len(found) == 1:
         return replace(found[0], fmap=refine_fmap(found[0].fmap, x, y, parameters, places))
     few = places[0].fewer(1000, 3000), places[1].fewer(1000, 3000)
     smaller = parameters.changed(k_max=max(parameters.k, min(K_CHOICE, parameters.k_max)))
-    found = [replace(f, fmap=refine_fmap(f.fmap, x, y, smaller, few)) for f in found]
-    scores = tuple(_score(f.fmap, x, y) for f in found)
+
+    def grown(fmap: Tensor) -> tuple[Tensor, float]:
+        larger = refine_fmap(fmap, x, y, smaller, few)
+        return larger, _score(larger, x, y)
+
+    pairs = in_parallel([partial(grown, f.fmap) for f in found])
+    found = [replace(f, fmap=larger) for f, (larger, _) in zip(found, pairs, strict=True)]
+    scores = tuple(score for _, score in pairs)
     best = found[min(range(len(found)), key=lambda i: scores[i] / (CLEARLY if found[i].synchronized else 1))]
     return replace(best, fmap=refine_fmap(best.fmap, x, y, parameters, places), scores=scores)
 
@@ -107,10 +117,15 @@ def _score(fmap: Float[Tensor, "K K"], x: PreparedShape, y: PreparedShape) -> fl
 
 
 def _synchronized(
-    full: FullMap, x: PreparedShape, y: PreparedShape, known_x: KnownSymmetry, known_y: KnownSymmetry
+    full: FullMap,
+    x: PreparedShape,
+    y: PreparedShape,
+    known_x: KnownSymmetry,
+    known_y: KnownSymmetry,
+    weights: Float[Tensor, "S S"],
 ) -> FullMap | None:
     """The map whose halves are chosen by neighbours, if the odd block chose otherwise on a tenth of the shape."""
-    halves = synchronized_halves(full.quotient, x, y, known_x, known_y)
+    halves = synchronized_halves(full.quotient, x, y, known_x, known_y, weights)
     source, target = full.quotient.source.full, full.quotient.target.full
     at_x = source.evecs[halves.samples]
     both = torch.stack([halves.images, known_y.group.maps[1][halves.images]])

@@ -19,7 +19,7 @@ from torchqm.spectral.descriptors import (
     wave_kernel_signature,
 )
 
-__all__ = ["basis_size", "curvature_descriptors", "initial_fmap", "shared_descriptors"]
+__all__ = ["basis_size", "curvature_descriptors", "fmap_from_coefficients", "initial_fmap", "shared_descriptors"]
 
 SHARPEST = 30.0
 """Curvature above which it is not told how much more: 1/30 of sqrt(area) is the radius of a finger."""
@@ -87,15 +87,38 @@ def initial_fmap(
         more: ``(Vx, D)`` and ``(Vy, D)`` descriptors of another kind.
         weight: of all of these together, where the others together have 1.
     """
-    coeffs_x, coeffs_y = unit_columns_pair(basis_x.coefficients(values_x), basis_y.coefficients(values_y))
+    coeffs = basis_x.coefficients(values_x), basis_y.coefficients(values_y)
+    rest = None if more is None else (basis_x.coefficients(more[0]), basis_y.coefficients(more[1]))
+    return fmap_from_coefficients(coeffs, basis_x.evals, basis_y.evals, commutativity, rest, weight)
+
+
+def fmap_from_coefficients(
+    coeffs: tuple[Float[Tensor, "Kx C"], Float[Tensor, "Ky C"]],
+    evals_x: Float[Tensor, " Kx"],
+    evals_y: Float[Tensor, " Ky"],
+    commutativity: float,
+    more: tuple[Float[Tensor, "Kx D"], Float[Tensor, "Ky D"]] | None = None,
+    weight: float = 0.5,
+) -> Float[Tensor, "Ky Kx"]:
+    """:func:`initial_fmap` where the coefficients of the descriptors are there already.
+
+    Args:
+        coeffs: of the descriptors of the source and of the target.
+        evals_x: eigenvalues of the source's basis.
+        evals_y: eigenvalues of the target's.
+        commutativity: as there.
+        more: coefficients of descriptors of another kind.
+        weight: as there.
+    """
+    coeffs_x, coeffs_y = unit_columns_pair(*coeffs)
     total = float(coeffs_x.shape[1])
     if more is not None:
-        more_x, more_y = unit_columns_pair(basis_x.coefficients(more[0]), basis_y.coefficients(more[1]))
+        more_x, more_y = unit_columns_pair(*more)
         scale = weight * (total / more_x.shape[1]) ** 0.5
         coeffs_x, coeffs_y = torch.cat([coeffs_x, scale * more_x], 1), torch.cat([coeffs_y, scale * more_y], 1)
         total *= 1 + weight**2
     # Exactly symmetric twins have odd functions without descriptors at equal frequencies: nothing is known of these.
-    return solve_fmap(coeffs_x, coeffs_y, basis_x.evals, basis_y.evals, commutativity * total / basis_x.k, ridge=1e-9)
+    return solve_fmap(coeffs_x, coeffs_y, evals_x, evals_y, commutativity * total / len(evals_x), ridge=1e-9)
 
 
 def unit_columns_pair(

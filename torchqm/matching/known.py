@@ -16,7 +16,7 @@ from torchqm.matching.parameters import MatchError, MatchParameters
 from torchqm.matching.parity import odd_halves
 from torchqm.matching.quality import orientation_agreement
 from torchqm.matching.self_map import nearest_involution
-from torchqm.matching.shape import PreparedShape
+from torchqm.matching.shape import PreparedShape, complete
 from torchqm.matching.symmetry_file import closure_fault, reflection_fault, return_error
 from torchqm.matching.transfer import transfer_symmetry
 from torchqm.symmetry.algebra import group_name
@@ -270,6 +270,7 @@ def transferred_symmetry(
 
     Arguments as in :func:`torchqm.matching.transfer.transfer_symmetry`, whose numbers go into ``details``.
     """
+    complete((shape, reference), parameters.local_weight > 0)
     moved = transfer_symmetry(shape, reference, known.group, known.sign, parameters, way)
     details: dict[str, Any] = {"reference": reference.mesh.label, "way": way, "self_map_scores": list(moved.scores)}
     if moved.odd is not None:

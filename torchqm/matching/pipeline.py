@@ -1,12 +1,14 @@
 """From two meshes to all the equally good dense maps, and the same for a collection of poses (paper, section 6.2)."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchqm.fmap.threads import in_parallel, one_thread, workers
 from torchqm.geometry.check import check_mesh
 from torchqm.geometry.io import load_mesh
 from torchqm.geometry.mesh import Mesh
@@ -25,6 +27,7 @@ from torchqm.matching.result import MatchResult, SymmetryResult
 from torchqm.matching.shape import N_ANCHORS, PreparedShape, prepare
 from torchqm.matching.steps import StepListener, Steps
 from torchqm.matching.subgroups import first_reflection
+from torchqm.spectral.cache import is_cached
 
 __all__ = ["METHODS", "SYMMETRIES", "Collection", "detect_symmetry", "find_symmetry", "match"]
 
@@ -205,10 +208,26 @@ class Collection:
         mesh = self.load(mesh)
         if id(mesh) not in self._shapes:
             with self.steps(f"eigenpairs of {mesh.name}", COST["eigenpairs"] * mesh.n_verts / 1000):
-                p = self.parameters
-                prepared = prepare(mesh, p.k_max, max(p.n_samples, N_ANCHORS), p.seed, cache_dir=self.cache_dir)
+                prepared = self._prepared(mesh)
             self._shapes[id(mesh)] = (mesh, prepared)  # the mesh is kept so that its id stays its own
         return self._shapes[id(mesh)][1]
+
+    def _prepared(self, mesh: Mesh) -> PreparedShape:
+        p = self.parameters
+        return prepare(mesh, p.k_max, max(p.n_samples, N_ANCHORS), p.seed, cache_dir=self.cache_dir)
+
+    def _read(self, *meshes: Mesh | PreparedShape) -> None:
+        """Make several meshes ready at the same time, if their eigenpairs are only read from the cache."""
+        new = [m for m in dict.fromkeys(meshes) if isinstance(m, Mesh) and id(m) not in self._shapes]
+        if len(new) < 2 or not all(is_cached(m, self.parameters.k_max, cache_dir=self.cache_dir) for m in new):
+            return
+        prepared: list[PreparedShape] = []
+        for number, mesh in enumerate(new):
+            with self.steps(f"eigenpairs of {mesh.name}", COST["eigenpairs"] * mesh.n_verts / 1000):
+                if not prepared:
+                    with one_thread():
+                        prepared = in_parallel([partial(self._prepared, m) for m in new])
+            self._shapes[id(mesh)] = (mesh, prepared[number])
 
     def symmetry(self, shape: PreparedShape, how: str = "extrinsic") -> KnownSymmetry:
         """The shape's symmetry: from the reference if there is one, else from itself.
@@ -240,18 +259,27 @@ class Collection:
         """The symmetry that a shape itself shows, by its mirror planes or its spectrum; a reference is not asked."""
         key = (id(shape), how)
         if key not in self._symmetries:
-            cost = shape.n_verts / 1000
-            if how == "detect":
-                # Only now is it known that this is needed; what is left grows by it.
-                work = DETECTION + COST["detect"] * cost
-                self.steps.total += work
-                with self.steps(f"symmetry of {shape.mesh.name} from its spectrum", work):
-                    known = detected_symmetry(shape, self.parameters)
-            else:
-                with self.steps(f"mirror plane of {shape.mesh.name}", COST["plane"] * cost):
-                    known = extrinsic_symmetry(shape)
-            self._symmetries[key] = (shape, known)
+            self._find_own(how, shape)
         return self._symmetries[key][1]
+
+    def _find_own(self, how: str, *shapes: PreparedShape) -> None:
+        """:meth:`own_symmetry` of several shapes, at the same time where there are workers."""
+        new = [s for s in dict.fromkeys(shapes) if (id(s), how) not in self._symmetries]
+        at_once = len(new) if workers() > 1 else 1
+        for start in range(0, len(new), at_once):
+            part, known = new[start : start + at_once], list[KnownSymmetry]()
+            for number, shape in enumerate(part):
+                name, cost = f"mirror plane of {shape.mesh.name}", COST["plane"] * shape.n_verts / 1000
+                if how == "detect":
+                    name = f"symmetry of {shape.mesh.name} from its spectrum"
+                    cost = DETECTION + COST["detect"] * shape.n_verts / 1000
+                    self.steps.total += cost  # only now is it known that this is needed: what is left grows by it
+                with self.steps(name, cost):  # the first step is that of all
+                    known = known or in_parallel([partial(self._own, how, s) for s in part])
+                self._symmetries[(id(shape), how)] = (shape, known[number])
+
+    def _own(self, how: str, shape: PreparedShape) -> KnownSymmetry:
+        return detected_symmetry(shape, self.parameters) if how == "detect" else extrinsic_symmetry(shape)
 
     def _larger(self, shape: PreparedShape, known: KnownSymmetry) -> KnownSymmetry:
         """The group that the spectrum shows, if it is larger: a pose may have kept a few of many mirror planes.
@@ -295,9 +323,13 @@ class Collection:
         self.steps.total = self.steps.done + self.expected_work(
             *meshes, symmetries=not isinstance(symmetry, str) or symmetry != "none"
         )
+        self._read(*meshes)
         x, y = (self.shape(m) for m in meshes)
-        known_x, known_y = self._both(x, y, symmetry, symmetry_source)
-        result = match_prepared(x, y, known_x, known_y, self.method, self.parameters, self.steps)
+        if self._reference is not None and not (isinstance(symmetry, str) and symmetry == "none"):
+            self.shape(self._reference)  # eigenpairs use all threads
+        with one_thread():
+            known_x, known_y = self._both(x, y, symmetry, symmetry_source)
+            result = match_prepared(x, y, known_x, known_y, self.method, self.parameters, self.steps)
         return replace(result, seconds=self.steps.since(earlier))
 
     def _both(
@@ -319,12 +351,17 @@ class Collection:
         if how not in SYMMETRIES:
             raise ValueError(f"symmetry={how!r}: allowed are {', '.join(SYMMETRIES)} or a table of vertex maps")
         first = "extrinsic" if how == "auto" else how
+        if first == "extrinsic" and isinstance(symmetry, str) and symmetry_source is None and self._reference is None:
+            self._find_own("extrinsic", y, x)
         known_y = given_symmetry(y, symmetry) if isinstance(symmetry, Tensor) else self.symmetry(y, first)
         if known_x is None and (isinstance(symmetry, str) or self.method != "semi"):
             known_x = self.symmetry(x, first)
         if how == "auto" and known_x is not None and not (known_x.firm or known_y.firm):
             # Nothing to rely on; a transfer from a shape with a firm plane would be quicker, and as good.
-            known_x = self.symmetry(x, "auto") if symmetry_source is None else known_x
+            if symmetry_source is None:
+                if self._reference is None:
+                    self._find_own("detect", x, y)
+                known_x = self.symmetry(x, "auto")
             known_y = self.symmetry(y, "auto")
         if known_x is None or _gives_way(known_x, known_y):
             known_x = self.transfer(x, y, known_y)

@@ -1,11 +1,15 @@
 """From two prepared shapes and their symmetries to the dense maps between them, with labels and scores."""
 
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from torchqm.fmap.convert import p2p_to_fmap
 from torchqm.fmap.refine import correspondence_fmap
+from torchqm.fmap.threads import in_parallel
 from torchqm.matching.candidates import full_map_from_blocks
 from torchqm.matching.initial import basis_size
 from torchqm.matching.known import KnownSymmetry, no_symmetry
@@ -21,7 +25,7 @@ from torchqm.matching.quotient import (
 )
 from torchqm.matching.result import MatchResult
 from torchqm.matching.semi_quotient import match_semi_quotient
-from torchqm.matching.shape import PreparedShape
+from torchqm.matching.shape import PreparedShape, complete
 from torchqm.matching.steps import Steps
 from torchqm.matching.subgroups import common_symmetry, one_reflection
 from torchqm.symmetry.orientation import orientation_cosine, orientation_tensor
@@ -67,16 +71,19 @@ def match_prepared(
     if not known_x.known:
         warnings.append("no symmetry is used: of several equally good maps one comes back, possibly a mixture of them")
     work = x.n_verts / 1000
+    curved = parameters.local_weight > 0
     oriented = x.oriented and y.oriented
     separated = None
     if method == "semi":
         with steps("semi-quotient matching", COST["quotient"] * work):
+            complete((x, y), False)
             semi = match_semi_quotient(x, y, known_y.group, parameters)
             even, p2p, fmap = semi.even, semi.orbit_map, None
             if known_y.known:
                 p2p = choose_halves(p2p, known_y.group, known_x.sign, known_y.sign)
     else:
         with steps("quotient matching", COST["quotient"] * work):
+            complete((x, y), curved)
             one = known_x.group.order == 1 or (known_x.reflection and known_y.reflection)
             k_used = None if one else quotient_size(known_x.group.order, parameters)
             found = match_quotient(x, y, known_x.group, known_y.group, parameters, k_used)
@@ -109,12 +116,20 @@ def match_prepared(
         if fmap is None:
             fmap = correspondence_fmap(p2p, x.basis.truncate(k), y.basis.truncate(k), x.samples)
         maps = known_y.group.maps[:, p2p]
-        agreement = [orientation_agreement(x.mesh, y.mesh, m) for m in maps]
         basis_y = y.basis.truncate(fmap.shape[0])
-        fmaps = torch.stack([p2p_to_fmap(m, basis_y, basis_y) @ fmap for m in known_y.group.maps])
+        n = len(maps)
+        # Row 0 is the identity; what takes longest comes first.
+        found_fmaps, numbers, omegas = _together(
+            [partial(p2p_to_fmap, m, basis_y, basis_y) for m in known_y.group.maps[1:]],
+            [partial(orientation_agreement, x.mesh, y.mesh, m) for m in maps]
+            + [partial(commutativity_score, m, x.basis, y.basis) for m in maps],
+            [partial(orientation_tensor, shape.mesh, shape.basis) for shape in (x, y) if oriented],
+        )
+        agreement, scores = numbers[:n], torch.tensor(numbers[n:], dtype=torch.float64)
+        fmaps = torch.stack([fmap, *(c @ fmap for c in found_fmaps)])
         label = "unknown"
         if oriented:
-            omega_x, omega_y = (orientation_tensor(shape.mesh, shape.basis) for shape in (x, y))
+            omega_x, omega_y = omegas
             cosines = [orientation_cosine(c, omega_x, omega_y) for c in fmaps]
             details |= {"orientation_cosines": cosines}
             # The elements of the group say how the maps are oriented to each other; so one label gives them all.
@@ -127,14 +142,13 @@ def match_prepared(
             warnings.append("a mesh is not consistently orientable: direct and mirrored cannot be told apart")
         elif separated is False or label == "unknown":
             label = "unknown"
-            numbers = {n: round(v, 2) for n, v in details.items() if n.startswith("residual")}
+            residuals = {n: round(v, 2) for n, v in details.items() if n.startswith("residual")}
             warnings.append(
                 f"direct and mirrored are not told apart: orientation agreement {[round(a, 2) for a in agreement]}"
-                + (f", residuals {numbers}" if numbers else "")
+                + (f", residuals {residuals}" if residuals else "")
             )
         other = {"direct": "mirrored", "mirrored": "direct", "unknown": "unknown"}[label]
         labels = [label if orientation > 0 else other for orientation in known_y.orientation.tolist()]
-        scores = torch.tensor([commutativity_score(m, x.basis, y.basis) for m in maps], dtype=torch.float64)
         if float(scores.min()) > POOR_SCORE:
             warnings.append(
                 f"no map is near an isometry (best score {float(scores.min()):.2f}, 0 is exact, {POOR_SCORE} is poor): "
@@ -158,6 +172,15 @@ def match_prepared(
         seconds=steps.since(earlier),
         details=details,
     )
+
+
+def _together(
+    first: Sequence[Callable[[], Tensor]], second: Sequence[Callable[[], float]], third: Sequence[Callable[[], Tensor]]
+) -> tuple[list[Tensor], list[float], list[Tensor]]:
+    """The results of three lists of tasks, all of which may run at the same time."""
+    found: list[Any] = in_parallel([*first, *second, *third])
+    a, b = len(first), len(first) + len(second)
+    return found[:a], found[a:b], found[b:]
 
 
 def _in_common(

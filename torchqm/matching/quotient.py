@@ -6,10 +6,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchqm.fmap.convert import fmap_to_p2p
+from torchqm.fmap.convert import deltas, fmap_to_p2p, nearest_used
 from torchqm.fmap.refine import correspondence_fmap, growing_sizes, quotient_icp, upsample
 from torchqm.fmap.two_way import Places, two_way_upsample
-from torchqm.matching.initial import basis_size, curvature_descriptors, initial_fmap, shared_descriptors
+from torchqm.matching.described import pair_descriptors
+from torchqm.matching.initial import basis_size, curvature_descriptors, fmap_from_coefficients
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.features import local_features
@@ -57,6 +58,11 @@ class QuotientMatch:
         """
         return fmap_to_p2p(self.fmap, self.source.even, self.target.even, self.time, y.search, x.search)
 
+    def orbit_map_of(self, ids: Int[Tensor, " S"]) -> Int[Tensor, " S"]:
+        """The same of some source vertices, compared with all target vertices."""
+        images = deltas(self.source.even.restricted(ids), self.time) @ self.fmap.T
+        return nearest_used(images, self.target.even, self.time)
+
 
 def match_quotient(
     x: PreparedShape,
@@ -83,9 +89,15 @@ def match_quotient(
     k = basis_size([x.basis, y.basis], parameters.k if k is None else k)
     source = symmetrized_basis(x.basis.truncate(k), group_x)
     target = symmetrized_basis(y.basis.truncate(k), group_y)
-    values_x, values_y = shared_descriptors([x.basis, y.basis], parameters)
-    more = curvature_descriptors(x, y) if parameters.local_weight > 0 else None
-    first = initial_fmap(source.even, target.even, values_x, values_y, parameters.commutativity, more)
+    described = pair_descriptors(x, y, parameters, k).coefficients
+    columns_x, columns_y = (s.even_coeffs.T @ c[:k] for s, c in zip((source, target), described, strict=True))
+    more = None
+    if parameters.local_weight > 0:
+        bends_x, bends_y = curvature_descriptors(x, y)
+        more = source.even.coefficients(bends_x), target.even.coefficients(bends_y)
+    first = fmap_from_coefficients(
+        (columns_x, columns_y), source.even.evals, target.even.evals, parameters.commutativity, more
+    )
     samples, among = x.samples[: parameters.n_samples], target.even.restricted(y.anchors)
     fmap = quotient_icp(
         first, source.even, among, samples, parameters.icp_steps, parameters.time, tolerance=parameters.icp_tolerance

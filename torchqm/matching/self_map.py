@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -10,8 +11,10 @@ from torch import Tensor
 from torchqm.fmap.convert import nearest_used, p2p_to_fmap
 from torchqm.fmap.refine import growing_sizes, nearest_isometry, quotient_icp, upsample
 from torchqm.fmap.solve import solve_fmap
+from torchqm.fmap.threads import in_parallel
 from torchqm.fmap.two_way import Places, growing_pairs, two_way_upsample
-from torchqm.matching.initial import basis_size, shared_descriptors, unit_columns_pair
+from torchqm.matching.described import PairDescriptors, pair_descriptors
+from torchqm.matching.initial import basis_size, unit_columns_pair
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.quality import commutator_norm
 from torchqm.matching.shape import N_ANCHORS, PreparedShape
@@ -61,7 +64,7 @@ def self_maps_from_halves(
     x: PreparedShape,
     sign: Float[Tensor, " V"],
     parameters: MatchParameters,
-    values: Float[Tensor, "V C"] | None = None,
+    values: Float[Tensor, "V C"] | PairDescriptors | None = None,
 ) -> list[Float[Tensor, "K K"]]:
     """Solve ``S f = f`` and ``S (eps f) = -eps f`` for all descriptors f, then refine by ICP; one map a weight.
 
@@ -70,25 +73,28 @@ def self_maps_from_halves(
         sign: its left-right map eps.
         parameters: ``k``, descriptors, ``icp_steps``; each of ``self_commutativity`` gives a candidate, as no single
             weight is best on all shapes.
-        values: descriptors f, if they are there already.
+        values: descriptors f, if they are there already, or those that x, the first of two shapes, shares with another.
 
     References:
         Paper, section 6.1, symmetry reconstruction.
     """
     basis = x.basis.truncate(basis_size([x.basis], parameters.k))
-    if values is None:
-        (values,) = shared_descriptors([x.basis], parameters)
-    even, odd = basis.coefficients(values), basis.coefficients(sign[:, None] * values)
+    if isinstance(values, Tensor):
+        even, odd = basis.coefficients(values), basis.coefficients(sign[:, None] * values)
+    else:
+        described = values or pair_descriptors(x, x, parameters)
+        even, odd = described.coefficients[0][: basis.k], described.weighted(x, basis.k, sign)
     f, g = unit_columns_pair(torch.cat([even, odd], 1), torch.cat([even, -odd], 1))
     samples, among = x.samples[: parameters.n_samples], basis.restricted(x.anchors)
-    found: list[Tensor] = []
-    for weight in parameters.self_commutativity:
+
+    def solved(weight: float) -> Tensor:
         fmap = solve_fmap(f, g, basis.evals, basis.evals, weight * f.shape[1] / basis.k, ridge=1e-9)
         fmap = quotient_icp(
             fmap, basis, among, samples, parameters.icp_steps, parameters.time, tolerance=parameters.icp_tolerance
         )
-        found.append(fmap if parameters.refinement == "icp" else nearest_involution(fmap))
-    return found
+        return fmap if parameters.refinement == "icp" else nearest_involution(fmap)
+
+    return in_parallel([partial(solved, weight) for weight in parameters.self_commutativity])
 
 
 def conjugate_reflection(
@@ -126,14 +132,22 @@ def best_self_map(
     if not candidates:
         raise ValueError("candidates: there must be at least one")
     k = min(K_CHOICE, parameters.k_max, x.basis.k)
-    grown: list[Tensor] = []
+    alike: list[int] = []  # for each candidate the first one that is nearly the same, and grows for both
     for number, candidate in enumerate(candidates):
         twins = [j for j in range(number) if candidates[j].shape == candidate.shape]
         near = [j for j in twins if float((candidates[j] - candidate).norm()) < 0.05 * float(candidate.norm())]
-        grown.append(grown[near[0]] if near else grow_self_map(candidate, x, parameters, k))
+        alike.append(alike[near[0]] if near else number)
+    different = sorted(set(alike))
+
+    def grow(number: int) -> tuple[Tensor, Tensor | None]:
+        fmap = grow_self_map(candidates[number], x, parameters, k)
+        return fmap, None if witness is None else _images(fmap, x, parameters)
+
+    results = dict(zip(different, in_parallel([partial(grow, j) for j in different]), strict=True))
+    grown = [results[j][0] for j in alike]
     scores = [reflection_score(fmap, x) for fmap in grown]
     if witness is not None:
-        images = [_images(fmap, x, parameters) for fmap in grown]
+        images = [image for j in alike if (image := results[j][1]) is not None]
         gaps = [float((image - images[witness]).norm(dim=1).mean()) for image in images]
         scores = [score + 0.3 * gap for score, gap in zip(scores, gaps, strict=True)]
     chosen = scores.index(min(scores))

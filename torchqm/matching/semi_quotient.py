@@ -9,7 +9,8 @@ from torch import Tensor
 from torchqm.fmap.convert import fmap_to_p2p
 from torchqm.fmap.nearest import SurfaceSearch
 from torchqm.fmap.refine import growing_sizes, nearest_isometry, semi_quotient_icp, semi_upsample
-from torchqm.matching.initial import basis_size, initial_fmap, shared_descriptors
+from torchqm.matching.described import pair_descriptors
+from torchqm.matching.initial import basis_size, fmap_from_coefficients
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.shape import PreparedShape
 from torchqm.symmetry.basis import SymmetrizedBasis, split_by_projector, symmetrized_basis
@@ -54,7 +55,6 @@ def match_semi_quotient(
     y: PreparedShape,
     group_y: SymmetryGroup,
     parameters: MatchParameters,
-    values: tuple[Float[Tensor, "Vx C"], Float[Tensor, "Vy C"]] | None = None,
 ) -> SemiQuotientMatch:
     """Match a shape without known symmetry to one whose symmetry group is given.
 
@@ -65,7 +65,6 @@ def match_semi_quotient(
         y: target.
         group_y: symmetry group of the target.
         parameters: ``k``, descriptors, ``icp_steps``, ``semi_width``, ``time`` are used.
-        values: the shared descriptors of both, if they are there already.
 
     References:
         Paper, section 5 and Lemma 5.1.
@@ -73,8 +72,9 @@ def match_semi_quotient(
     k = basis_size([x.basis, y.basis], parameters.k)
     basis_x = x.basis.truncate(k)
     target = symmetrized_basis(y.basis.truncate(k), group_y)
-    values_x, values_y = values or shared_descriptors([x.basis, y.basis], parameters)
-    fmap = initial_fmap(basis_x, target.even, values_x, values_y, parameters.commutativity)
+    columns_x, columns_y = (c[:k] for c in pair_descriptors(x, y, parameters).coefficients)
+    columns = columns_x, target.even_coeffs.T @ columns_y
+    fmap = fmap_from_coefficients(columns, basis_x.evals, target.even.evals, parameters.commutativity)
     samples = x.samples[: parameters.n_samples]
     among = target.even.restricted(y.anchors)
     fmap = semi_quotient_icp(

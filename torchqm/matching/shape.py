@@ -1,7 +1,8 @@
 """A mesh made ready for matching: unit area, eigenbasis, samples; computed once a shape and used by every pair."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import torch
@@ -9,7 +10,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.fmap.nearest import SurfaceSearch
-from torchqm.geometry.check import MeshReport, inspect_mesh, orient_faces
+from torchqm.fmap.threads import in_parallel
+from torchqm.geometry.check import MeshReport, clean_faces, inspect_mesh, orient_faces
 from torchqm.geometry.laplacian import laplacian
 from torchqm.geometry.mesh import Mesh
 from torchqm.geometry.sampling import area_samples
@@ -18,7 +20,7 @@ from torchqm.spectral.cache import cache_folder, cached_basis
 from torchqm.spectral.eigen import eigenbasis
 from torchqm.spectral.features import smooth_curvature
 
-__all__ = ["N_ANCHORS", "PreparedShape", "prepare"]
+__all__ = ["N_ANCHORS", "PreparedShape", "complete", "prepare"]
 
 N_ANCHORS = 5000
 """Vertices of the target among which refinement steps look for partners, and around which dense searches look."""
@@ -59,15 +61,40 @@ class PreparedShape:
     @cached_property
     def curvature(self) -> Float[Tensor, " V"]:
         """Smooth mean curvature (:func:`torchqm.spectral.features.smooth_curvature`)."""
-        return smooth_curvature(self.mesh)
+        return _curvature(self)
 
     @cached_property
     def search(self) -> SurfaceSearch | None:
         """Two-stage search for dense maps onto this shape; None where it is small enough to compare all vertices."""
-        if self.n_verts < 2 * N_ANCHORS or len(self.samples) < N_ANCHORS:
-            return None
-        far = torch.where(self.mesh.referenced[:, None], self.mesh.verts, 1e3)  # unit area: out of every neighbourhood
-        return SurfaceSearch.build(far, self.anchors)
+        return _search(self)
+
+
+def _curvature(shape: PreparedShape) -> Float[Tensor, " V"]:
+    return smooth_curvature(shape.mesh)
+
+
+def _search(shape: PreparedShape) -> SurfaceSearch | None:
+    if shape.n_verts < 2 * N_ANCHORS or len(shape.samples) < N_ANCHORS:
+        return None
+    far = torch.where(shape.mesh.referenced[:, None], shape.mesh.verts, 1e3)  # unit area: out of every neighbourhood
+    return SurfaceSearch.build(far, shape.anchors)
+
+
+_LAZY: dict[str, Callable[[PreparedShape], object]] = {"search": _search, "curvature": _curvature}
+
+
+def complete(shapes: Sequence[PreparedShape], curvature: bool = True) -> None:
+    """Compute what shapes compute when it is first asked for, all at the same time as far as there are workers.
+
+    Args:
+        shapes: the shapes.
+        curvature: whether theirs is going to be used.
+    """
+    # Not through the properties: they lock, before Python 3.12 one for all shapes together.
+    names = ["search", "curvature"] if curvature else ["search"]
+    todo = [(s, name) for s in dict.fromkeys(shapes) for name in names if name not in s.__dict__]
+    for (shape, name), found in zip(todo, in_parallel([partial(_LAZY[n], s) for s, n in todo]), strict=True):
+        shape.__dict__[name] = found
 
 
 def prepare(
@@ -99,7 +126,9 @@ def prepare(
     problems: tuple[str, ...] = ()
     if basis is None and cache_folder(cache_dir) is not None:
         kept = cached_basis(mesh, k, kind, cache_dir, whole_clusters=False, warn=False)
-        basis, problems = kept.scaled(mesh.area**-0.5), kept.report.problems
+        scale = mesh.area**-0.5  # SpectralBasis.scaled, in place: nobody else has this array
+        basis = SpectralBasis(kept.evals / scale**2, kept.evecs.div_(scale), kept.mass * scale**2)
+        problems = kept.report.problems
         origin = f"{kept.report.source}{', from the cache' if kept.report.outcome == 'read' else ''}"
         operator = f"{kept.report.kind}: {kept.report.reason}; eigenpairs: {origin}"
     else:
@@ -113,7 +142,7 @@ def prepare(
 
 def _outward(mesh: Mesh, report: MeshReport) -> tuple[Mesh, bool, list[str]]:
     """Unit-area mesh with cleaned, consistently oriented triangles, normals outward where that has a meaning."""
-    faces = orient_faces(mesh)
+    faces = clean_faces(mesh) if report.oriented else orient_faces(mesh)
     if faces is None:
         return mesh.normalized(), False, ["the surface is not orientable"]
     turned = replace(mesh, faces=faces).normalized()

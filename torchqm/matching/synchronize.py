@@ -15,7 +15,7 @@ from torchqm.matching.known import KnownSymmetry
 from torchqm.matching.quotient import QuotientMatch
 from torchqm.matching.shape import PreparedShape
 
-__all__ = ["SynchronizedHalves", "synchronize_signs", "synchronized_halves"]
+__all__ = ["SynchronizedHalves", "neighbour_weights", "sample_weights", "synchronize_signs", "synchronized_halves"]
 
 N_POINTS = 1000
 """Samples that are synchronized; the map is grown from these."""
@@ -49,8 +49,24 @@ class SynchronizedHalves:
         return max(same, 1 - same)
 
 
+def sample_weights(x: PreparedShape, known_x: KnownSymmetry) -> Float[Tensor, "S S"]:
+    """:func:`neighbour_weights` of the first :data:`N_POINTS` samples of a shape with a reflection."""
+    samples = x.samples[:N_POINTS]
+    here, there = (_embedded(x, ids) for ids in (samples, known_x.group.maps[1][samples]))
+    return neighbour_weights(here, there)
+
+
+def _embedded(shape: PreparedShape, ids: Int[Tensor, " S"]) -> Float[Tensor, "S P"]:
+    return shape.basis.truncate(min(N_EMBEDDING, shape.basis.k)).restricted(ids).biharmonic()
+
+
 def synchronized_halves(
-    match: QuotientMatch, x: PreparedShape, y: PreparedShape, known_x: KnownSymmetry, known_y: KnownSymmetry
+    match: QuotientMatch,
+    x: PreparedShape,
+    y: PreparedShape,
+    known_x: KnownSymmetry,
+    known_y: KnownSymmetry,
+    weights: Float[Tensor, "S S"] | None = None,
 ) -> SynchronizedHalves:
     """Choose among the points of each orbit so that neighbours stay neighbours, and mirror images mirror images.
 
@@ -65,18 +81,16 @@ def synchronized_halves(
         y: target.
         known_x: one reflection.
         known_y: one reflection.
+        weights: of the source (:func:`sample_weights`), if they are there already.
 
     References:
         Beyond the paper; takes the place of the left-right partition of section 6.1 in section 6.2, step 3.
     """
     samples = x.samples[:N_POINTS]
-    orbit_map = match.orbit_map(x, y)[samples]
+    orbit_map = match.orbit_map_of(samples)
     mirror = known_y.group.maps[1]
-    points_y = y.basis.biharmonic(N_EMBEDDING)
-    displacement = (points_y[orbit_map] - points_y[mirror[orbit_map]]) / 2
-    points_x = x.basis.biharmonic(N_EMBEDDING)
-    images = points_x[known_x.group.maps[1][samples]]
-    signs, satisfied = synchronize_signs(points_x[samples], images, displacement)
+    displacement = (_embedded(y, orbit_map) - _embedded(y, mirror[orbit_map])) / 2
+    signs, satisfied = _signs(sample_weights(x, known_x) if weights is None else weights, displacement)
     chosen = torch.where(signs > 0, orbit_map, mirror[orbit_map])
     return SynchronizedHalves(samples, chosen, displacement.square().sum(1), satisfied)
 
@@ -104,18 +118,31 @@ def synchronize_signs(
         >>> (signs[0] * signs).tolist(), satisfied
         ([1.0, -1.0, 1.0, 1.0], 1.0)
     """
+    return _signs(neighbour_weights(points, mirrored), displacement)
+
+
+def neighbour_weights(points: Float[Tensor, "S P"], mirrored: Float[Tensor, "S P"]) -> Float[Tensor, "S S"]:
+    """``w_ij``: positive between neighbours, negative between a sample and neighbours of its mirror image.
+
+    Args:
+        points: ``(S, P)`` places of samples in an embedding.
+        mirrored: ``(S, P)`` places of their mirror images.
+    """
     n = len(points)
     k = min(NEIGHBOURS, n - 1)
     near = torch.cdist(points, points).fill_diagonal_(torch.inf).topk(k, dim=1, largest=False)
     across = torch.cdist(mirrored, points).topk(k, dim=1, largest=False)
     scale = near.values.mean().clamp_min(torch.finfo(points.dtype).tiny)
-    products = displacement @ displacement.T
-    couplings = torch.zeros_like(products)
+    total = points.new_zeros(n, n)
     for found, sign in ((near, 1.0), (across, -1.0)):
-        weight = torch.zeros_like(products).scatter_(1, found.indices, torch.exp(-((found.values / scale) ** 2)))
-        couplings += sign * torch.maximum(weight, weight.T) * products
-    couplings.fill_diagonal_(0.0)
-    signs = torch.tensor(_joined(couplings), dtype=points.dtype, device=points.device)
+        weight = torch.zeros_like(total).scatter_(1, found.indices, torch.exp(-((found.values / scale) ** 2)))
+        total += sign * torch.maximum(weight, weight.T)
+    return total.fill_diagonal_(0.0)
+
+
+def _signs(weights: Float[Tensor, "S S"], displacement: Float[Tensor, "S D"]) -> tuple[Float[Tensor, " S"], float]:
+    couplings = weights * (displacement @ displacement.T)
+    signs = torch.tensor(_joined(couplings), dtype=weights.dtype, device=weights.device)
     satisfied = _share((signs[:, None] * couplings * signs).sum(), couplings.abs().sum())
     return signs, (1 + satisfied) / 2
 

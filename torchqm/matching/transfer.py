@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchqm.fmap.convert import fmap_to_p2p
 from torchqm.fmap.refine import growing_sizes, upsample
-from torchqm.matching.initial import shared_descriptors
+from torchqm.matching.described import pair_descriptors
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.self_map import best_self_map, conjugate_reflection, self_maps_from_halves
@@ -80,8 +80,7 @@ def transfer_symmetry(
     """
     if group_y.order != 2:
         raise ValueError(f"group_y has {group_y.order} elements: symmetry transfer needs one reflection, {{id, S}}")
-    values_x, values_y = shared_descriptors([x.basis, y.basis], parameters)
-    semi = match_semi_quotient(x, y, group_y, parameters, (values_x, values_y))
+    semi = match_semi_quotient(x, y, group_y, parameters)
     halves, odd, more = None, None, []
     warnings: list[str] = []
     if way == "clustering":
@@ -99,7 +98,7 @@ def transfer_symmetry(
             )
     else:
         raise ValueError(f"way={way!r}: allowed are 'clustering' and 'full_map'")
-    candidates = [*more, *self_maps_from_halves(x, sign, parameters, values_x)]
+    candidates = [*more, *self_maps_from_halves(x, sign, parameters, pair_descriptors(x, y, parameters))]
     found = best_self_map(candidates, x, parameters, witness=0 if more else None)
     basis = x.basis.truncate(found.fmap.shape[0])
     group = SymmetryGroup.from_reflection(fmap_to_p2p(found.fmap, basis, basis, search=x.search, guide=x.search))

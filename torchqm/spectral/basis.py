@@ -48,7 +48,10 @@ class SpectralBasis:
 
     def coefficients(self, values: Float[Tensor, "V C"]) -> Float[Tensor, "K C"]:
         """Coefficients of functions given by their vertex values (the orthogonal projection)."""
-        return self.evecs_trans @ values
+        # The narrower factor is multiplied by the mass; no transposed copy is made.
+        if values.ndim == 2 and values.shape[1] < self.k:
+            return self.evecs.T @ (self.mass[:, None] * values)
+        return (self.evecs * self.mass[:, None]).T @ values
 
     def truncate(self, k: int) -> "SpectralBasis":
         """The first ``k`` functions.

@@ -27,6 +27,7 @@ __all__ = [
     "CachedBasis",
     "cache_folder",
     "cached_basis",
+    "is_cached",
     "read_basis",
 ]
 
@@ -180,6 +181,12 @@ def read_basis(
     folder, looked = cache_folder(cache_dir), _Looked()
     entry = None if folder is None else _find(folder, content_hash(mesh), mesh, k, kind, looked)
     return None if entry is None else _served(entry, "read", k, whole_clusters, looked, begin)
+
+
+def is_cached(mesh: Mesh, k: int, kind: str = "auto", cache_dir: str | Path | None = None) -> bool:
+    """Whether the cache has a file that should serve ``k`` functions of a mesh; it is not opened."""
+    folder = cache_folder(cache_dir)
+    return folder is not None and kind in KINDS and bool(entry_files(folder, content_hash(mesh), kind, k))
 
 
 def _served(entry: Entry, outcome: str, k: int, whole_clusters: bool, looked: _Looked, begin: float) -> CachedBasis:

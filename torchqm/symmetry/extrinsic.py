@@ -86,9 +86,9 @@ def find_reflections(mesh: Mesh, n_samples: int = 500, n_refine: int = 3, seed: 
     centre = weights @ verts
     verts = verts - centre
     used = np.flatnonzero(weights > 0)
-    tree = scipy.spatial.cKDTree(verts[used])
+    tree = _tree(verts[used])
     few, many = (verts[area_samples(mesh, min(n, used.size), seed).numpy()] for n in (n_samples, 4 * n_samples))
-    coarse = scipy.spatial.cKDTree(verts[area_samples(mesh, min(5000, used.size), seed).numpy()])
+    coarse = _tree(verts[area_samples(mesh, min(5000, used.size), seed).numpy()])
     spacing = float(np.sqrt((np.asarray(tree.query(many, k=2)[0])[:, 1] ** 2).mean()))
     coarse_spacing = float(np.sqrt((np.asarray(coarse.query(few, k=2)[0])[:, 1] ** 2).mean()))
 
@@ -155,7 +155,7 @@ def extrinsic_group(mesh: Mesh, planes: Sequence[ExtrinsicReflection], most: int
     verts, mass = mesh.verts.numpy(), mesh.vertex_areas.numpy()
     used = np.flatnonzero(mass > 0)
     scale = float(mesh.area) ** 0.5
-    tree = scipy.spatial.cKDTree(verts[used])
+    tree = _tree(verts[used])
     motions = [(np.eye(3), np.zeros(3))]
     maps, residuals = [np.arange(len(verts))], [0.0]
     for plane in planes:
@@ -242,6 +242,11 @@ def _half_sphere(n: int) -> np.ndarray:
     angle = np.arange(n) * np.pi * (3 - np.sqrt(5))
     radius = np.sqrt(1 - height**2)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+
+
+def _tree(points: np.ndarray) -> "scipy.spatial.cKDTree":
+    """A tree for queries that lie off the points: large leaves and tight boxes less, which is half the time there."""
+    return scipy.spatial.cKDTree(points, leafsize=48, compact_nodes=False, balanced_tree=False)
 
 
 def _nearest(tree: "scipy.spatial.cKDTree", points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

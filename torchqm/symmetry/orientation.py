@@ -4,8 +4,6 @@
 Intrinsic descriptors say nothing about the odd half of a map; once the even half is known, these functions do.
 """
 
-from dataclasses import replace
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -22,6 +20,8 @@ __all__ = [
     "orientation_form",
     "orientation_tensor",
 ]
+
+_FACES = 1024  # of a block: what is computed for it stays in the cache of one core
 
 
 def function_pairs(n: int) -> Int[Tensor, "2 P"]:
@@ -114,12 +114,30 @@ def orientation_coefficients(
         pairs: which.
         evecs: functions to test against: the odd basis.
     """
-    # Loop over corners instead of gathering (F, 3, K): at 100k faces and 100 functions that would be a third of a GiB.
-    form = orientation_form(mesh, values, pairs)
-    at_vertices = torch.zeros(mesh.n_verts, form.shape[1], dtype=form.dtype)
-    for corner in range(3):
-        at_vertices.index_add_(0, mesh.faces[:, corner], form / 3)
-    return evecs.T @ at_vertices
+    used, (a, b) = torch.unique(pairs, return_inverse=True)
+    omega = _integrals(values[:, used], mesh.faces, evecs)
+    return omega[:, a, b]
+
+
+def _integrals(
+    values: Float[Tensor, "V N"], faces: Int[Tensor, "F 3"], evecs: Float[Tensor, "V K"]
+) -> Float[Tensor, "K N N"]:
+    """``<phi_k, omega(f_a, f_b)>`` of all pairs, over some triangles.
+
+    The form is ``(u_a v_b - v_a u_b) / 2`` with differences u, v along two edges, and the integral of a linear function
+    is the mean of its corners; so ``sum m_k u_a v_b``, a matrix product, holds both terms. No array of faces and pairs
+    is made.
+    """
+    k, n = evecs.shape[1], values.shape[1]
+    total = evecs.new_zeros(k * n, n)
+    for block in faces.split(_FACES):
+        first, second, third = block.T
+        means = evecs[first].add_(evecs[second]).add_(evecs[third])
+        base = values[first]
+        u, v = values[second] - base, values[third] - base
+        total.addmm_((means[:, :, None] * u[:, None, :]).flatten(1).T, v)
+    omega = total.view(k, n, n) / 6
+    return omega - omega.mT
 
 
 def orientation_tensor(
@@ -135,12 +153,9 @@ def orientation_tensor(
         n_faces: about how many triangles are used, evenly: what is compared is smooth.
     """
     n, k = min(n, basis.k), min(k, basis.k)
-    few = replace(mesh, faces=mesh.faces[:: max(1, mesh.n_faces // n_faces)])
-    a, b = pairs = function_pairs(n)
-    form = orientation_form(few, basis.evecs[:, :n], pairs) * (mesh.n_faces / max(few.n_faces, 1))
-    found = basis.evecs[:, :k][few.faces].mean(1).T @ form
-    omega = found.new_zeros(k, n, n)
-    omega[:, a, b], omega[:, b, a] = found, -found
+    few = mesh.faces[:: max(1, mesh.n_faces // n_faces)]
+    omega = _integrals(basis.evecs[:, :n], few, basis.evecs[:, :k]) * (mesh.n_faces / max(len(few), 1))
+    omega[:, 0] = omega[:, :, 0] = 0.0  # the constant function, whose gradient is zero up to rounding
     return omega
 
 
