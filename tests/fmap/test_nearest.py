@@ -33,6 +33,12 @@ def test_agrees_with_all_distances(search, q, p, d):
         assert torch.equal(found, dense.nearest_rows(queries, points))
 
 
+def test_what_all_points_share_costs_no_digits(search):
+    """Descriptors are such points: large, and all nearly the same."""
+    queries, points = noise(200, 12), noise(300, 12, seed=1)
+    assert torch.equal(search(queries + 3e5, points + 3e5), dense.nearest_rows(queries, points))
+
+
 def test_points_find_themselves(search):
     points = noise(100, 5)
     assert torch.equal(search(points, points), torch.arange(100))

@@ -38,6 +38,9 @@ def nearest_rows(queries: Float[Tensor, "Q D"], points: Float[Tensor, "P D"]) ->
         raise ValueError("points: there are none to choose from")
     if not bool(torch.isfinite(queries.sum() + points.sum())):  # NaN and infinities survive a sum
         raise ValueError("queries and points must be finite; a spectral coordinate is NaN or infinite")
+    # Distances are differences of products: what all points share would cost the digits that tell them apart.
+    centre = points.mean(0)
+    queries, points = queries - centre, points - centre
     if queries.shape[0] * points.shape[0] <= _SMALL:
         # || q - p ||^2 without || q ||^2, which is the same for all points
         return torch.argmax(queries @ points.T - points.square().sum(1) / 2, dim=1)
