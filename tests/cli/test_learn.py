@@ -11,7 +11,7 @@ from torchqm.cli.learn import evaluate, fit, learn
 from torchqm.learn import MatchModule
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-FILES = sorted(path.relative_to(CONFIGS).as_posix() for path in CONFIGS.rglob("*.yaml"))
+FILES = sorted(path.relative_to(CONFIGS).as_posix() for path in CONFIGS.rglob("*.yaml") if path.parent.name != "sweep")
 TINY = [
     *("--data.root", "synthetic:kinds=ellipsoid;verts=500;triangulation=shared", "--data.shares", "[1,0,0]"),
     *(

@@ -102,6 +102,8 @@ class SwappedTruths(Dataset[Item]):
 class PairDataModule(LightningDataModule):
     """Pairs to train, validate and test on, from the shapes of a folder or the built-in creatures.
 
+    Batches are those of :func:`torchqm.data.collate` without ``truth``, which is for measuring in the end.
+
     Args:
         root: what :func:`torchqm.data.open_shapes` understands: a folder, or ``synthetic:...``.
         pairs: which pairs of each part, in the words of :func:`torchqm.data.choose_pairs`.
@@ -231,5 +233,10 @@ class PairDataModule(LightningDataModule):
             sampler=EpochSampler(len(pairs), given["seed"]) if part == "train" else None,
             num_workers=given["workers"],
             persistent_workers=given["workers"] > 0,
-            collate_fn=collate,
+            collate_fn=_batch,
         )
+
+
+def _batch(pairs: Sequence[Item]) -> Item:
+    """Without the truths, objects that Lightning cannot convert to another precision; ``corr`` is trained on."""
+    return collate([{key: value for key, value in pair.items() if key != "truth"} for pair in pairs])

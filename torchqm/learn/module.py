@@ -30,7 +30,7 @@ class MatchModule(LightningModule):
     weights) is kept in the run folder if the trainer has a logger: ``stopped-step-N.pt``.
 
     With ``Trainer(precision="bf16-mixed")`` the linear layers of the network compute in bfloat16; signatures,
-    diffusion, bases, solves and losses stay in float32. It is meant for GPUs: on a CPU the step is slower than in float32.
+    diffusion, bases, solves and losses stay in float32. It is meant for GPUs: on a CPU a step gets slower by it.
 
     All arguments but the last three are those of :class:`torchqm.learn.options.NetOptions`.
 
