@@ -119,9 +119,9 @@ def _sweep(arguments: argparse.Namespace) -> tuple[list[Any], list[str]]:
         options={**sweep.options, **dict(arguments.set)},
         grid={**sweep.grid, **dict(arguments.grid)},
     )
-    _quiet()
     from torchqm.cli.learn import learn
 
+    _quiet()
     for run in runs_of(replace(sweep, seeds=sweep.seeds[:1]), arguments.out):
         learn(run.arguments, run=False)  # a wrong key is found before the first run, not after it
     with Progress() as progress:
@@ -146,6 +146,8 @@ def _quiet() -> None:
     """Lightning tells of every run what accelerators there are; one line for each run is enough here."""
     import logging
     import warnings
+
+    import torchqm.cli.lightning  # noqa: F401 - importing Lightning sets its levels
 
     for name in ("pytorch_lightning", "lightning_fabric", "lightning.fabric", "lightning.pytorch"):
         logging.getLogger(name).setLevel(logging.ERROR)
