@@ -5,14 +5,15 @@
 Both take the same pairs from the same loader, start from the same weights and step with the same AdamW. One round is an
 epoch of four pairs with the one, then one with the other; a step is the time from one batch to the next, so that
 loading, logging, checks and callbacks (those of ``torchqm fit``, with its logger) are counted. The first step of an
-epoch is left out, since what is built once falls into it. Writes benchmarks/results/learning_step.json.
+epoch is left out, since what is built once falls into it. Seconds are those of the clock and those of the processor in
+this process; on a machine with other work only the latter compare. Writes benchmarks/results/learning_step.json.
 """
 
 import argparse
 import tempfile
 import warnings
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
@@ -29,21 +30,28 @@ from torchqm.learn.options import SETUPS
 BOUND_SHARE = 0.10
 
 
+Seconds = list[tuple[float, float]]
+"""Of the clock, and of the processor."""
+
+
 class Clock(Callback):
     """Seconds from each batch to the next."""
 
     def __init__(self) -> None:
-        self.seconds: list[float] = []
-        self._begin: float | None = None
+        self.seconds: Seconds = []
+        self._begin: tuple[float, float] | None = None
 
-    def on_train_batch_start(self, *_: Any) -> None:
-        now = perf_counter()
+    def tick(self) -> None:
+        now = perf_counter(), process_time()
         if self._begin is not None:
-            self.seconds.append(now - self._begin)
+            self.seconds.append((now[0] - self._begin[0], now[1] - self._begin[1]))
         self._begin = now
 
+    def on_train_batch_start(self, *_: Any) -> None:
+        self.tick()
 
-def under_lightning(module: MatchModule, data: PairDataModule, folder: Path) -> list[float]:
+
+def under_lightning(module: MatchModule, data: PairDataModule, folder: Path) -> Seconds:
     """An epoch as ``torchqm fit`` has it; the checkpoint at its end is no part of a step."""
     clock = Clock()
     trainer = Trainer(
@@ -62,20 +70,17 @@ def under_lightning(module: MatchModule, data: PairDataModule, folder: Path) -> 
     return clock.seconds
 
 
-def bare(net: torch.nn.Module, data: PairDataModule, lr: float) -> list[float]:
+def bare(net: torch.nn.Module, data: PairDataModule, lr: float) -> Seconds:
     """The same steps in a loop."""
     optimizer = torch.optim.AdamW(net.parameters(), lr=lr, weight_decay=0.0)
-    seconds, begin = [], None
+    clock = Clock()
     for batch in data.train_dataloader():
-        now = perf_counter()
-        if begin is not None:
-            seconds.append(now - begin)
-        begin = now
+        clock.tick()
         loss = sum(net.losses(batch).values())
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    return seconds
+    return clock.seconds
 
 
 def main() -> None:
@@ -100,7 +105,7 @@ def main() -> None:
     )
     data.setup("fit")
     vertices = [int(batch["first"]["verts_mask"].sum()) for batch in data.train_dataloader()]  # computes all bases
-    rows: dict[str, list[list[float]]] = {"lightning": [], "bare": []}
+    rows: dict[str, list[Seconds]] = {"lightning": [], "bare": []}
     with tempfile.TemporaryDirectory() as folder:
         for number in range(args.rounds + 1):
             print(f"round {number} of {args.rounds}", flush=True)
@@ -111,8 +116,10 @@ def main() -> None:
             if number:  # the first round is to warm up
                 for name, seconds in found.items():
                     rows[name].append(seconds)
-    medians = {name: float(np.median(seconds)) for name, seconds in rows.items()}
-    ratios = [float(np.median(a) / np.median(b)) for a, b in zip(rows["lightning"], rows["bare"], strict=True)]
+    every = {name: np.array(values) for name, values in rows.items()}  # (rounds, steps, 2)
+    medians = {name: np.median(values, axis=(0, 1)) for name, values in every.items()}
+    overhead = medians["lightning"] / medians["bare"] - 1
+    rounds = np.median(every["lightning"], 1) / np.median(every["bare"], 1) - 1
     load = Path("/proc/loadavg")
     result = {
         "vertices": vertices[0],
@@ -121,14 +128,18 @@ def main() -> None:
         "network": args.network,
         "rounds": args.rounds,
         "steps_per_round": len(rows["bare"][0]),
-        "median_seconds": medians,
-        "overhead_share": medians["lightning"] / medians["bare"] - 1,
-        "overhead_share_median_of_rounds": float(np.median(ratios)) - 1,
+        "median_seconds": {name: float(value[0]) for name, value in medians.items()},
+        "median_processor_seconds": {name: float(value[1]) for name, value in medians.items()},
+        "overhead_share": float(overhead[0]),
+        "overhead_share_processor": float(overhead[1]),
+        "overhead_shares_of_rounds": rounds[:, 0],
+        "overhead_shares_of_rounds_processor": rounds[:, 1],
         "bound_share": BOUND_SHARE,
         "load_average_at_the_end": load.read_text().split()[0] if load.exists() else None,
-        "seconds": rows,
+        "seconds": {name: values[..., 0] for name, values in every.items()},
+        "processor_seconds": {name: values[..., 1] for name, values in every.items()},
     }
-    print({key: value for key, value in result.items() if key != "seconds"})
+    print({key: value for key, value in result.items() if not key.endswith("seconds") or "median" in key})
     write_json(args.out, result)
 
 
