@@ -33,10 +33,11 @@ def draw_pair(net: Any, batch: Mapping[str, Any], path: str | Path, number: int 
         p2p = matched.maps.points(y["verts_mask"])[0].cpu()
         known = "corr" in x and bool(x["corr_mask"].any())
         errors = net.errors({"first": x, "second": y}, matched) if known else {}
-    shown = ", ".join(f"{name.replace('_', ' ')} {value.item():.3f}" for name, value in errors.items())
+    names = ("orbit_error", "flipped_points")  # a line each: the figure is narrow
+    shown = "".join(f"\n{name.replace('_', ' ')} {errors[name].item():.3f}" for name in names if name in errors)
     source, target = _mesh(x), _mesh(y)
     label = "one of each orbit" if net.options.setup == "quotient" else "learned"
-    title = f"{source.name} to {target.name}" + (f"\n{shown}" if shown else "")
+    title = f"{source.name} to {target.name}{shown}"
     return match_figure(source, target, p2p[None, : source.n_verts], [label], path, title=title)
 
 
