@@ -1,8 +1,8 @@
-"""Test a trained matcher: python train/evaluate.py RUN [--data.test_root ...], RUN the folder of a training."""
+"""Test a trained matcher: python train/evaluate.py RUN [--data.test_root ...]; as `torchqm test`."""
 
 import sys
 
-from torchqm.cli.learn import evaluate
+from torchqm.cli.main import main
 
 if __name__ == "__main__":
-    evaluate(sys.argv[1:])
+    sys.exit(main(["test", *sys.argv[1:]]))

@@ -2,7 +2,7 @@
 
 import sys
 
-from torchqm.cli.learn import fit
+from torchqm.cli.main import main
 
 if __name__ == "__main__":
-    fit(sys.argv[1:])
+    sys.exit(main(["fit", *sys.argv[1:]]))

@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import pytest
 import torch
 from pytorch_lightning import Callback, Trainer
@@ -6,6 +8,7 @@ from torch.utils.data import DataLoader
 from torchqm.data import collate
 from torchqm.learn import MatchModule
 from torchqm.learn.callbacks import LastEpoch
+from torchqm.learn.faults import StepError
 
 SMALL = {"k": 20, "signature": 16, "channels": 12, "width": 24, "odd_pairs": 20, "dropout": 0.2}
 
@@ -43,11 +46,11 @@ def loaders(pairs):
     return DataLoader(single, sampler=Shuffled(), collate_fn=collate), DataLoader(single, collate_fn=collate)
 
 
-def trainer(folder, epochs, *callbacks, checkpoints=True):
+def trainer(folder, epochs, *callbacks, checkpoints=True, **more):
     kept = [LastEpoch(folder)] if checkpoints else []
     return Trainer(
         accelerator="cpu", max_epochs=epochs, logger=False, callbacks=[*kept, *callbacks], num_sanity_val_steps=0,
-        enable_checkpointing=checkpoints, enable_progress_bar=False, enable_model_summary=False,
+        enable_checkpointing=checkpoints, enable_progress_bar=False, enable_model_summary=False, **more,
     )  # fmt: skip
 
 
@@ -112,4 +115,51 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_names_the_pairs(pairs, tmp_
     module = MatchModule("quotient", **SMALL)
     module.net.options.__dict__["w_align"] = float("inf")
     with pytest.raises(FloatingPointError, match=r"the loss is inf .*l_align inf.*quadruped-0-pose0 -> quadruped-0-po"):
+        trainer(tmp_path, 1, checkpoints=False).fit(module, *loaders(pairs))
+
+
+class Losses(Callback):
+    """The loss of each step."""
+
+    def __init__(self):
+        self.values = []
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        self.values.append(outputs["loss"].item())
+
+
+def test_mixed_precision_trains_as_the_whole_one_does(pairs, tmp_path):
+    courses = {}
+    for precision in ("32-true", "bf16-mixed"):
+        module, course = MatchModule("quotient", **(SMALL | {"dropout": 0.0})), Losses()
+        trainer(tmp_path, 6, course, checkpoints=False, precision=precision).fit(module, *loaders(pairs))
+        assert all(p.dtype == torch.float32 and p.isfinite().all() for p in module.parameters())
+        courses[precision] = [sum(course.values[i : i + 2]) for i in range(0, 12, 2)]
+    whole, mixed = courses.values()
+    assert whole != mixed
+    assert all(after < before for before, after in pairwise(mixed))
+    assert abs(mixed[-1] - whole[-1]) < 0.1 * (whole[0] - whole[-1])  # what it learns, it learns in both
+
+
+def test_a_gradient_that_is_not_finite_stops_before_the_weights_are_spoiled(pairs, tmp_path):
+    class Spoiled(Callback):
+        def on_after_backward(self, trainer, pl_module):
+            if trainer.global_step == 1:
+                next(pl_module.parameters()).grad.fill_(float("inf"))
+
+    module = MatchModule("quotient", **SMALL)
+    with pytest.raises(
+        StepError, match=r"the gradient of net.features.net.layers.0.weight is not finite at the pairs b"
+    ):
+        trainer(tmp_path, 1, Spoiled(), checkpoints=False).fit(module, *loaders(pairs))
+    assert all(p.isfinite().all() for p in module.parameters())
+
+
+def test_numbers_that_a_layer_refuses_are_told_with_the_pairs(pairs, tmp_path):
+    module = MatchModule("quotient", **SMALL)
+    with torch.no_grad():
+        next(module.parameters()).fill_(float("nan"))
+    with pytest.raises(
+        StepError, match=r"feat_x: .* are NaN .* at the pairs \w+-0-pose0 -> \w+-0-pose1, in step 0 of epoch 0$"
+    ):
         trainer(tmp_path, 1, checkpoints=False).fit(module, *loaders(pairs))

@@ -120,3 +120,62 @@ def test_shapes_without_symmetry_have_an_empty_odd_block(pairs):
     assert all(p.grad is None or p.grad.isfinite().all() for p in net.parameters())
     full = net_of("functional_map").losses(batch)
     torch.testing.assert_close(net.losses(batch, matched)["l_lap"], full["l_lap"], rtol=1e-6, atol=1e-8)
+
+
+def in_float32(pairs):
+    return collate([
+        {side: {k: v.float() if torch.is_tensor(v) and v.is_floating_point() else v for k, v in pair[side].items()}
+         for side in ("first", "second")}
+        for pair in pairs
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize("network", ["mlp", "diffusion"])
+@pytest.mark.parametrize(("setup", "supervision", "truth_form"), [KINDS[2], KINDS[6], KINDS[8]])
+def test_under_autocast_nothing_but_the_features_is_in_low_precision(setup, supervision, truth_form, network, pairs):
+    net, batch = net_of(setup, supervision, truth_form, network=network).float(), in_float32(pairs)
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        given = {side: net.features(batch[side]) for side in ("first", "second")}
+        mixed, maps = net.losses(batch), net(batch["first"], batch["second"])
+        errors = net.errors(batch, maps)
+    assert {feat.dtype for feat in given.values()} == {torch.bfloat16}
+    features = {id(batch[side]): given[side] for side in given}
+    net.features.forward = lambda item: features[id(item)]  # the rest of the network, in float32, on these features
+    with torch.no_grad():
+        whole = net.losses(batch)
+        wanted = net.errors(batch, net(batch["first"], batch["second"]))
+    for name, value in whole.items():
+        assert value.dtype == mixed[name].dtype == torch.float32
+        assert torch.equal(mixed[name], value), name
+    assert all(torch.equal(errors[name], value) for name, value in wanted.items())
+
+
+@pytest.mark.parametrize(("setup", "supervision", "truth_form"), [KINDS[0], KINDS[5], KINDS[7]])
+def test_mixed_losses_agree_within_the_rounding_of_linear_layers(setup, supervision, truth_form, pairs):
+    """To first order a rounding of v by dv changes the loss by dL/dv dv, where |dv| <= unit |v|.
+
+    A weight is rounded once for all vertices: the worst case, summed. Inputs and results of the layers are rounded at
+    each vertex on their own: errors evenly spread on +-unit |v|, of which six standard deviations are allowed.
+    """
+    unit = 2.0**-9
+    net, batch = net_of(setup, supervision, truth_form).float(), in_float32(pairs)
+    inputs, rounded = net.features.inputs.forward, []
+    net.features.inputs.forward = lambda item: inputs(item).requires_grad_()
+
+    def keep(layer, given, result):
+        for value in (*given, result):
+            value.retain_grad()
+            rounded.append(value)
+
+    linear = [layer for layer in net.modules() if isinstance(layer, torch.nn.Linear)]
+    handles = [layer.register_forward_hook(keep) for layer in linear]
+    loss = sum(net.losses(batch).values())
+    loss.backward()
+    for handle in handles:
+        handle.remove()
+    weights = sum((p.grad * p).abs().sum().item() for p in net.parameters())
+    values = sum((v.grad * v).square().sum().item() for v in rounded) ** 0.5
+    bound = unit * (weights + 6 * values / 3**0.5)
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        mixed = sum(net.losses(batch).values())
+    assert 0 < (mixed - loss).abs() <= bound < 0.1 * loss

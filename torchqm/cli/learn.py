@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from torchqm.cli.console import UserError
+
 if TYPE_CHECKING:
     from pytorch_lightning.cli import LightningCLI
 
@@ -21,7 +23,7 @@ def learn(args: Sequence[str], run: bool = True) -> "LightningCLI":
 
     Raises:
         ImportError: the extra is not installed.
-        SystemExit: an argument that is wrong, with a message that names it.
+        UserError: an argument or a file that is wrong, with the nearest key that is right; a run that cannot go on.
     """
     try:
         from torchqm.cli.lightning import MatchCLI
@@ -39,15 +41,15 @@ def evaluate(args: Sequence[str]) -> "LightningCLI":
     """Test: ``RUN [--data.root ...]``, RUN the folder of a training; its best checkpoint, or its last, is taken.
 
     Raises:
-        ValueError: the folder is no run, or has no checkpoint.
+        UserError: the folder is no run, or has no checkpoint.
     """
     if not args or args[0].startswith("-"):
         return learn(["test", *args])
     folder = Path(args[0])
     if not (folder / CONFIG_NAME).is_file():
-        raise ValueError(f"{folder}: no folder of a run; {CONFIG_NAME} is missing")
+        raise UserError(f"{folder}: no folder of a run; {CONFIG_NAME} is missing")
     found = sorted((folder / "checkpoints").glob("best*.ckpt")) or sorted((folder / "checkpoints").glob("*.ckpt"))
     if not found:
-        raise ValueError(f"{folder}: no checkpoint in {folder / 'checkpoints'}")
+        raise UserError(f"{folder}: no checkpoint in {folder / 'checkpoints'}")
     own = ["--config", str(folder / CONFIG_NAME), "--ckpt_path", str(found[-1])]
     return learn(["test", *own, *args[1:]])

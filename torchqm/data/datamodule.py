@@ -9,7 +9,8 @@ from typing import Any
 
 import torch
 from pytorch_lightning import LightningDataModule
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.distributed import get_rank, get_world_size, is_available, is_initialized
+from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from torchqm.data.base import ShapeSet
 from torchqm.data.collate import collate
@@ -25,33 +26,41 @@ Item = dict[str, Any]
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
-class EpochSampler(Sampler[int]):
+class EpochSampler(DistributedSampler[int]):
     """An order that depends on the seed and the number of the epoch alone, so that a run can be resumed at any epoch.
+
+    Of n processes each takes every n-th of the order, so that their batches together are those that one process makes
+    of n times as many (the first are taken again where their number is no multiple of n). Lightning would put a sampler
+    of its own, with another order, around any that is no ``DistributedSampler``.
 
     Args:
         size: how many.
         seed: of the draw.
+        replicas: processes; those of torch.distributed if not given, one if it does not run.
+        rank: number of this process.
 
     Example:
         >>> sampler = EpochSampler(4, seed=1)
         >>> sampler.set_epoch(2)
         >>> list(sampler) == list(sampler), sorted(sampler)
         (True, [0, 1, 2, 3])
+        >>> parts = [list(EpochSampler(4, seed=1, replicas=2, rank=rank)) for rank in (0, 1)]
+        >>> [v for pair in zip(*parts) for v in pair] == list(EpochSampler(4, seed=1))
+        True
     """
 
-    def __init__(self, size: int, seed: int = 0) -> None:
-        self.size, self.seed, self.epoch = size, seed, 0
-
-    def set_epoch(self, epoch: int) -> None:
-        """Called by Lightning before each epoch."""
-        self.epoch = epoch
-
-    def __len__(self) -> int:
-        return self.size
+    def __init__(self, size: int, seed: int = 0, replicas: int | None = None, rank: int | None = None) -> None:
+        if replicas is None:
+            spread = is_available() and is_initialized()
+            replicas, rank = (get_world_size(), get_rank()) if spread else (1, 0)
+        super().__init__(range(size), replicas, rank, seed=seed)  # type: ignore[arg-type]
+        self.size = size
 
     def __iter__(self) -> Iterator[int]:
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.epoch)
-        return iter(torch.randperm(self.size, generator=generator).tolist())
+        order = torch.randperm(self.size, generator=generator).tolist()
+        order += order * (self.total_size // max(self.size, 1))
+        return iter(order[: self.total_size][self.rank :: self.num_replicas])
 
 
 class SwappedTruths(Dataset[Item]):
@@ -92,6 +101,8 @@ class SwappedTruths(Dataset[Item]):
 
 class PairDataModule(LightningDataModule):
     """Pairs to train, validate and test on, from the shapes of a folder or the built-in creatures.
+
+    Batches are those of :func:`torchqm.data.collate` without ``truth``, which is for measuring in the end.
 
     Args:
         root: what :func:`torchqm.data.open_shapes` understands: a folder, or ``synthetic:...``.
@@ -222,5 +233,10 @@ class PairDataModule(LightningDataModule):
             sampler=EpochSampler(len(pairs), given["seed"]) if part == "train" else None,
             num_workers=given["workers"],
             persistent_workers=given["workers"] > 0,
-            collate_fn=collate,
+            collate_fn=_batch,
         )
+
+
+def _batch(pairs: Sequence[Item]) -> Item:
+    """Without the truths, objects that Lightning cannot convert to another precision; ``corr`` is trained on."""
+    return collate([{key: value for key, value in pair.items() if key != "truth"} for pair in pairs])

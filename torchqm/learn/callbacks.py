@@ -45,9 +45,10 @@ class Versions(Callback):
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Before anything else of the run."""
-        if trainer.log_dir is None or not trainer.is_global_zero or stage != "fit":
+        given = trainer.log_dir  # asks all processes, so all must come here, and once each
+        if given is None or not trainer.is_global_zero or stage != "fit":
             return
-        folder = Path(trainer.log_dir)
+        folder = Path(given)
         folder.mkdir(parents=True, exist_ok=True)
         text = json.dumps(versions(), indent=2) + "\n"
         write_whole(folder / "versions.json", lambda file: file.write(text.encode()))

@@ -1,13 +1,16 @@
 """The matcher as a LightningModule."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
-from typing import Any
+from pathlib import Path
+from typing import Any, NoReturn
 
 import torch
 from pytorch_lightning import LightningModule
 from torch import Tensor
 
+from torchqm.learn.faults import StepError, pair_names, save_batch
 from torchqm.learn.net import MatchNet
 from torchqm.learn.options import NetOptions
 
@@ -21,6 +24,13 @@ class MatchModule(LightningModule):
     pairs have a truth ``plain_error``, ``orbit_error`` (straight lines through space / sqrt(area), see
     :mod:`torchqm.fmap.straight_errors`), ``flipped_map`` and ``flipped_points``, after ``val_`` or ``test_``.
     What a run reports in the end is measured by :mod:`torchqm.evaluate`.
+
+    A run stops where a loss, a gradient or what a layer is given is not finite: before the step is taken, so that the
+    weights and all checkpoints are those of the steps before. The pairs are named, and what the step had (batch and
+    weights) is kept in the run folder if the trainer has a logger: ``stopped-step-N.pt``.
+
+    With ``Trainer(precision="bf16-mixed")`` the linear layers of the network compute in bfloat16; signatures,
+    diffusion, bases, solves and losses stay in float32. It is meant for GPUs: on a CPU a step gets slower by it.
 
     All arguments but the last three are those of :class:`torchqm.learn.options.NetOptions`.
 
@@ -92,6 +102,13 @@ class MatchModule(LightningModule):
         with torch.random.fork_rng(devices=[]):  # the weights depend on the seed alone, not on what was drawn before
             torch.manual_seed(seed)
             self.net = MatchNet(options)
+        self._folder: Path | None = None
+        self._batch: Any = None
+
+    def setup(self, stage: str) -> None:
+        """Ask all processes for the folder now: one that fails later cannot."""
+        folder = self.trainer.log_dir if self.trainer.loggers else None
+        self._folder = None if folder is None else Path(folder)
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
         """The batch with its tensors on the device; a truth stays where it is, only ``corr`` is computed with."""
@@ -100,14 +117,29 @@ class MatchModule(LightningModule):
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         """Draw anew in each step: what a run does in it does not depend on whether it was stopped before."""
         torch.manual_seed(_mixed(self.hparams["seed"], self.global_step))
+        self._batch = batch
 
     def training_step(self, batch: Mapping[str, Any], batch_idx: int) -> Tensor:
         """The loss of a batch of pairs.
 
         Raises:
-            FloatingPointError: it is not finite; the pairs are named.
+            StepError: it is not finite, or a layer refuses its numbers; the pairs are named.
         """
-        return self._log("train", self.net.losses(batch), batch)
+        with self._named(batch):
+            terms = self.net.losses(batch)
+        return self._log("train", terms, batch)
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Stop before a gradient that is not finite spoils the weights, and with them the next checkpoint.
+
+        Raises:
+            StepError: the pairs are named.
+        """
+        if self.trainer.precision == "16-mixed":  # there the scaler skips such a step, and goes on with a smaller scale
+            return
+        bad = [name for name, p in self.named_parameters() if p.grad is not None and not bool(p.grad.isfinite().all())]
+        if bad:
+            self._stop(f"the gradient of {', '.join(bad)} is not finite", self._batch)
 
     def validation_step(self, batch: Mapping[str, Any], batch_idx: int) -> None:
         """Log loss and errors."""
@@ -122,8 +154,10 @@ class MatchModule(LightningModule):
         return torch.optim.AdamW(self.parameters(), lr=self.hparams["lr"], weight_decay=self.hparams["weight_decay"])
 
     def _measure(self, stage: str, batch: Mapping[str, Any]) -> None:
-        matched = self.net(batch["first"], batch["second"])
-        self._log(stage, self.net.losses(batch, matched), batch)
+        with self._named(batch):
+            matched = self.net(batch["first"], batch["second"])
+            terms = self.net.losses(batch, matched)
+        self._log(stage, terms, batch)
         if "corr" not in batch["first"] or not bool(batch["first"]["corr_mask"].any(-1).all()):
             return  # a pair without truth has no error
         errors = self.net.errors(batch, matched)
@@ -133,15 +167,34 @@ class MatchModule(LightningModule):
     def _log(self, stage: str, terms: Mapping[str, Tensor], batch: Mapping[str, Any]) -> Tensor:
         loss = torch.stack(list(terms.values())).sum()
         if not bool(loss.isfinite()):
-            pairs = zip(batch["first"]["name"], batch["second"]["name"], strict=True)
             shown = ", ".join(f"{name} {value.item():g}" for name, value in terms.items())
-            raise FloatingPointError(
-                f"the loss is {loss.item():g} ({shown}) at the pairs {', '.join(f'{a} -> {b}' for a, b in pairs)}"
-            )
+            self._stop(f"the loss is {loss.item():g} ({shown})", batch)
         n = len(batch["first"]["name"])
         values = {f"{stage}_{name}": value.detach() for name, value in {"loss": loss, **terms}.items()}
         self.log_dict(values, on_step=False, on_epoch=True, batch_size=n, sync_dist=True)
         return loss
+
+    @contextmanager
+    def _named(self, batch: Mapping[str, Any]) -> Iterator[None]:
+        """Layers refuse what is not finite, and systems that rounding made singular: say at which pairs."""
+        try:
+            yield
+        except ValueError as error:
+            self._stop(str(error), batch, error)
+
+    def _stop(self, reason: str, batch: Mapping[str, Any], cause: Exception | None = None) -> NoReturn:
+        step = self.global_step
+        text = f"{reason} at the pairs {', '.join(pair_names(batch))}, in step {step} of epoch {self.current_epoch}"
+        if self._folder is None:
+            raise StepError(text) from cause
+        name = (
+            f"stopped-step-{step}.pt" if self.trainer.world_size == 1 else f"stopped-step-{step}-{self.global_rank}.pt"
+        )
+        given = {key: value for key, value in self.hparams.items() if not key.startswith("_")}  # Lightning's own
+        path = save_batch(
+            self._folder / name, batch, state_dict=self.state_dict(), hparams=given, reason=reason, step=step
+        )
+        raise StepError(f"{text}; batch and weights are kept in {path}") from cause
 
 
 def _moved(value: Any, device: torch.device) -> Any:

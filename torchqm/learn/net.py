@@ -80,10 +80,13 @@ class MatchNet(nn.Module):
 
     def forward(self, x: Item, y: Item) -> Matched:
         """Maps between the shapes of two padded batches of :func:`torchqm.data.collate`."""
+        given_x, given_y = (self.features(item).to(item["mass"].dtype) for item in (x, y))
+        with _whole_precision(x):
+            return self._matched(x, y, normalize(given_x, dim=-1), normalize(given_y, dim=-1))
+
+    def _matched(self, x: Item, y: Item, feat_x: Tensor, feat_y: Tensor) -> Matched:
         with_odd = self.options.setup == "quotient+odd"
-        (feat_x, bases_x), (feat_y, bases_y) = (
-            (normalize(self.features(item), dim=-1), bases_of(item, self.split, with_odd)) for item in (x, y)
-        )
+        bases_x, bases_y = (bases_of(item, self.split, with_odd) for item in (x, y))
         if not with_odd:
             return Matched(solved_maps(self.solver, feat_x, feat_y, bases_x, bases_y), feat_x, feat_y)
         odd_x, odd_y = self._odd(feat_x, x, bases_x[1]), self._odd(feat_y, y, bases_y[1])
@@ -98,8 +101,12 @@ class MatchNet(nn.Module):
             batch: pairs of :func:`torchqm.data.collate`; with a supervision, both shapes have ``corr``.
             matched: what :meth:`forward` made of it, if that is known already.
         """
+        found = self(batch["first"], batch["second"]) if matched is None else matched
+        with _whole_precision(batch["first"]):
+            return self._terms(batch, found)
+
+    def _terms(self, batch: Mapping[str, Any], found: Matched) -> dict[str, Tensor]:
         x, y, o = batch["first"], batch["second"], self.options
-        found = self(x, y) if matched is None else matched
         total: dict[str, Tensor] = {}
         soft: dict[str, Any] = {}
         if o.w_align > 0 or (o.supervision != "none" and o.truth_form != "spectral"):
@@ -124,7 +131,8 @@ class MatchNet(nn.Module):
     def errors(self, batch: Mapping[str, Any], matched: Matched) -> dict[str, Float[Tensor, " B"]]:
         """Quick errors of the point maps, for each pair: :func:`torchqm.fmap.straight_errors.error_means`."""
         x, y = batch["first"], batch["second"]
-        p2p = matched.maps.points(y["verts_mask"])
+        with _whole_precision(x):
+            p2p = matched.maps.points(y["verts_mask"])
         errors = straight_errors(p2p, y["corr"], x["corr"], y["verts"], y["mass"], y["group"])
         return error_means(errors, point_weights(y["corr"], errors, x["mass"], x["corr"], x["corr_mask"]))
 
@@ -153,3 +161,8 @@ class MatchNet(nn.Module):
         """Odd descriptors without what the odd basis does not hold, which is noise of the triangulation."""
         raw = self.odd(feat, item["faces"], item["mass"])
         return unit_mean_square(basis.evecs @ (basis.evecs_trans @ raw), item["mass"])
+
+
+def _whole_precision(item: Item) -> torch.autocast:
+    """Solves, bases and losses of a mixed run: products of eigenfunctions would lose what they are there to tell."""
+    return torch.autocast(item["mass"].device.type, enabled=False)

@@ -1,0 +1,55 @@
+"""The LightningCLI in more than one process."""
+
+import csv
+import os
+import subprocess
+import sys
+
+import pytest
+import yaml
+
+from torchqm.cli.learn import fit
+
+ROOT = "synthetic:kinds=ellipsoid;poses=4;verts=500;triangulation=shared"
+
+
+def arguments(folder, name, *more):
+    """Four pairs to train on, in two epochs, and two to validate on; everything in double precision."""
+    names = [f"ellipsoid-0-pose{pose}" for pose in range(4)]
+    split = folder / "split.yaml"
+    split.write_text(yaml.safe_dump({"train": names[:2], "validation": names[2:]}))
+    options = {
+        "data": {"root": ROOT, "split": str(split), "pairs": "within-class+self", "dtype": "float64"},
+        "model": {"k": 20, "channels": 6, "width": 8, "signature": 8, "setup": "quotient+odd", "odd_pairs": 8},
+        "trainer": {"max_epochs": 2, "accelerator": "cpu", "precision": "64-true", "num_sanity_val_steps": 0,
+                    "enable_progress_bar": False, "log_every_n_steps": 1},
+        "trainer.logger": {"init_args.save_dir": str(folder), "init_args.version": name},
+        "pictures": {"every": 0},
+    }  # fmt: skip
+    given = [word for group, values in options.items() for key, value in values.items()
+             for word in (f"--{group}.{key}", str(value))]  # fmt: skip
+    return [*given, *more]
+
+
+def logged(folder):
+    with (folder / "metrics.csv").open() as file:
+        rows = [{key: float(cell) for key, cell in row.items() if cell} for row in csv.DictReader(file)]
+    return [{key: v for row in rows if row["epoch"] == epoch for key, v in row.items()} for epoch in (0, 1)]
+
+
+def test_two_processes_train_as_one_with_twice_the_batch(tmp_path):
+    words = arguments(tmp_path, "two", "--data.batch_size", "1", "--trainer.devices", "2", "--trainer.strategy", "ddp")
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1"}
+    command = [sys.executable, "-m", "torchqm", "fit", *words]
+    running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
+    fit(arguments(tmp_path, "one", "--data.batch_size", "2", "--trainer.devices", "1"))
+    text, _ = running.communicate(timeout=120)
+    assert running.returncode == 0, text
+    assert "distributed_backend=gloo" in text
+    assert "MEMBER: 2/2" in text
+    one, two = logged(tmp_path / "one"), logged(tmp_path / "two")
+    assert set(one[0]) == set(two[0]) >= {"train_loss", "train_l_align", "val_loss", "val_orbit_error"}
+    assert one[1]["train_loss"] < one[0]["train_loss"]
+    for first, second in zip(one, two, strict=True):
+        assert second == pytest.approx(first, rel=1e-9, abs=1e-12)
+    assert {path.name for path in (tmp_path / "two").iterdir()} >= {"config.yaml", "versions.json", "curves.png"}

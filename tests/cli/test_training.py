@@ -1,0 +1,156 @@
+"""The commands `torchqm fit` and `torchqm test`, as a user gives them."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from torchqm.cli.main import build_parser, main
+from torchqm.learn import MatchModule
+
+QUICK = Path(__file__).resolve().parents[2] / "configs" / "experiment" / "quick.yaml"
+ROOT = "synthetic:kinds=ellipsoid;poses=6;verts=500;triangulation=shared"
+SMALL = {"k": 8, "channels": 6, "width": 8, "signature": 8, "setup": "quotient"}
+
+
+def config(folder, **more):
+    """A run of seconds: two pairs, to and fro, to train on, and as many to validate and to test."""
+    names = [f"ellipsoid-0-pose{pose}" for pose in range(6)]
+    split = folder / "split.yaml"
+    split.write_text(yaml.safe_dump({"train": names[:2], "validation": names[2:4], "test": names[4:]}))
+    values = {
+        "model": dict(SMALL),
+        "data": {"root": ROOT, "split": str(split), "batch_size": 2},
+        "trainer": {
+            "max_epochs": 2,
+            "accelerator": "cpu",
+            "enable_progress_bar": False,
+            "num_sanity_val_steps": 0,
+            "log_every_n_steps": 1,
+            "logger": {
+                "class_path": "torchqm.learn.logger.RunLogger",
+                "init_args": {"save_dir": str(folder), "version": "run"},
+            },
+        },
+    }
+    for key, value in more.items():
+        group, name = key.split("__")
+        values.setdefault(group, {})[name] = value
+    path = folder / "config.yaml"
+    path.write_text(yaml.safe_dump(values))
+    return path
+
+
+def error_of(capsys, *argv):
+    assert main(list(argv)) == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("torchqm: error: ")]
+    return line.removeprefix("torchqm: error: ")
+
+
+def test_everything_after_the_command_is_passed_on():
+    given = ["--config", "a.yaml", "stray", "--help", "--data.root=x", "-c"]
+    for command in ("fit", "test"):
+        assert build_parser().parse_args([command, *given]).arguments == given
+
+
+def test_only_the_commands_themselves_load_lightning():
+    code = (
+        "import sys; from torchqm.cli.main import main\n"
+        "try: main(sys.argv[1:])\nexcept SystemExit as stop: status = stop.code\n"
+        "heavy = {'torch', 'pytorch_lightning', 'jsonargparse'} & {n.split('.')[0] for n in sys.modules}\n"
+        "print('LOADED', status, sorted(heavy))"
+    )
+    for words, loaded in ((["--help"], "LOADED 0 []"), (["match", "--help"], "LOADED 0 []")):
+        run = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
+        assert run.stdout.splitlines()[-1] == loaded
+
+
+def test_help_of_the_command_is_that_of_its_options(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["fit", "--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert text.startswith("usage: torchqm")
+    assert "--model.setup" in text
+    assert "--pictures.every" in text
+
+
+def test_a_run_folder_has_pictures_curves_events_and_metrics(tmp_path, capsys):
+    assert main(["fit", "--config", str(config(tmp_path)), "--pictures.every", "2"]) == 0
+    run = tmp_path / "run"
+    kinds = {path.name.split(".")[0] if "tfevents" in path.name else path.name for path in run.iterdir()}
+    wanted = {"config.yaml", "versions.json", "metrics.csv", "curves.png", "pictures", "checkpoints", "events"}
+    assert wanted <= kinds
+    (picture,) = (run / "pictures").iterdir()
+    assert picture.name == "epoch-0002-ellipsoid-0-pose2-to-ellipsoid-0-pose3.png"
+    assert {path.name.split("-")[0] for path in (run / "checkpoints").iterdir()} == {"best", "last.ckpt"}
+    assert main(["test", str(run), "--trainer.logger.init_args.version", "tested"]) == 0
+    assert "test_orbit_error" in (tmp_path / "tested" / "metrics.csv").read_text()
+
+
+def test_bad_keys_values_and_roots_are_one_line(tmp_path, capsys):
+    given = str(config(tmp_path))
+    assert error_of(capsys, "fit", "--config", given, "--model.lrr", "3") == (
+        "--model.lrr: no such option; the nearest is --model.lr"
+    )
+    assert error_of(capsys, "fit", "--config", given, "--model.lr", "fast") == (
+        "--model.lr: 'fast' given, expected float"
+    )
+    assert error_of(capsys, "fit", "--config", given, "--trainer.logger.init_args.save_di", "x") == (
+        "--trainer.logger.init_args.save_di: torchqm.learn.logger.RunLogger has no such argument; "
+        "the nearest is save_dir"
+    )
+    assert error_of(capsys, "fit", "--config", given, "--model.setup", "half").startswith(
+        "setup: 'half' given, allowed"
+    )
+    (tmp_path / "empty").mkdir()
+    assert error_of(capsys, "fit", "--config", given, "--data.root", str(tmp_path / "empty")).startswith(
+        f"{tmp_path / 'empty'}: the folder is empty"
+    )
+    assert not (tmp_path / "run").exists()
+    for key, line in (("model__lrr", "model.lrr: no such key; the nearest is model.lr"),
+                      ("modle__lr", "modle.lr: no such key; the nearest is model.lr")):  # fmt: skip
+        path = config(tmp_path, **{key: 0.1})
+        assert error_of(capsys, "fit", "--config", str(path)) == f"{path}: {line}"
+    assert error_of(capsys, "test", str(tmp_path / "empty")).startswith(f"{tmp_path / 'empty'}: no folder of a run")
+
+
+def test_a_run_that_cannot_go_on_names_the_pairs_keeps_the_batch_and_the_checkpoints(tmp_path, capsys, monkeypatch):
+    def spoiled(self):  # what a learning rate that is too high comes to, in the second epoch
+        if self.current_epoch == 1:
+            with torch.no_grad():
+                next(self.parameters()).fill_(float("nan"))
+
+    monkeypatch.setattr(MatchModule, "on_train_epoch_start", spoiled)
+    line = error_of(capsys, "fit", "--config", str(config(tmp_path)))
+    file = tmp_path / "run" / "stopped-step-1.pt"
+    assert "at the pairs ellipsoid-0-pose" in line
+    assert line.endswith(f"in step 1 of epoch 1; batch and weights are kept in {file}")
+    kept = torch.load(file, weights_only=True)
+    assert sorted(kept["pairs"]) == [f"ellipsoid-0-pose{a} -> ellipsoid-0-pose{1 - a}" for a in (0, 1)]
+    assert kept["batch"]["first"]["evecs"].shape[0] == 2
+    again = MatchModule(**kept["hparams"])
+    again.load_state_dict(kept["state_dict"])
+    with pytest.raises(ValueError, match=kept["reason"].split(":")[0]):
+        again.net.losses(kept["batch"])
+    last = MatchModule.load_from_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
+    assert all(p.isfinite().all() for p in last.parameters())
+    assert (tmp_path / "run" / "curves.png").is_file()
+
+
+def test_an_interrupt_says_how_to_go_on(tmp_path, capsys, monkeypatch):
+    def interrupted(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(MatchModule, "on_train_epoch_start", interrupted)
+    import signal
+
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        assert main(["fit", "--config", str(config(tmp_path))]) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert "go on with --ckpt_path RUN/checkpoints/last.ckpt" in capsys.readouterr().err

@@ -1,0 +1,133 @@
+"""What jsonargparse says about a config or an argument that is wrong, as one line: where, what, and the nearest key."""
+
+import re
+from collections.abc import Iterator, Sequence
+from difflib import SequenceMatcher
+from importlib import import_module
+from inspect import signature
+from pathlib import Path
+from typing import Any
+
+__all__ = ["explained", "nearest_key"]
+
+_NEAR = 0.5
+
+
+def explained(message: str, keys: Sequence[str], args: Sequence[str]) -> str:
+    r"""One line for an error of the parser.
+
+    Args:
+        message: what the parser says.
+        keys: all that it knows, such as ``model.lr``.
+        args: what it was given: ``--config FILE``, ``--model FILE``, ``--model.lr 3`` and so on.
+
+    Example:
+        >>> explained("unrecognized arguments: --model.lrr 3", ["model.lr", "data.root"], ["--model.lrr", "3"])
+        '--model.lrr: no such option; the nearest is --model.lr'
+        >>> explained('Parser key "model.k": Expected a <class \'int\'>. Got value: ten', ["model.k"], [])
+        "model.k: 'ten' given, expected int"
+    """
+    files = list(_files(args))
+    if faults := [f"{path}: not readable as YAML ({error})" for path, _, error in files if error]:
+        return faults[0]
+    if found := re.search(r"unrecognized arguments: (\S+)", message):
+        word = found[1].split("=")[0]
+        if not word.startswith("--"):
+            return f"{word}: not expected here; options begin with '--'"
+        return f"{word}: no such option; {_hint(word.removeprefix('--'), keys, '--')}"
+    if found := re.search(r"does not accept option '([^']+)'", message):
+        return f"{_place(found[1], args, files)}: no such key; {_hint(found[1], keys)}"
+    head = re.match(r'(?:Parser key|argument) (?:--|")?([\w.]+)"?:', message)
+    inner = re.search(r"Problem with given class_path '([^']+)':\s+Option '([^']+)' is not accepted", message)
+    if head and inner:
+        key = f"{head[1]}.init_args.{inner[2]}"
+        return f"{_place(key, args, files)}: {inner[1]} has no such argument; {_hint(inner[2], _arguments(inner[1]))}"
+    if found := re.fullmatch(
+        r"the following arguments are required: (?:fit\.|test\.|predict\.)?([\w.]+)", message.strip()
+    ):
+        return f"--{found[1]}: not given, but needed"
+    expected = list(dict.fromkeys(re.findall(r"Expected a <class '([\w.]+)'>", message)))
+    given = re.search(r"(?:Got value|Given value): (.*)", message, re.DOTALL)
+    if head and expected and given:
+        names = {"NoneType": "null", "collections.abc.Iterable": "a list"}
+        words = " or ".join(names.get(word, word) for word in expected)
+        words = f"a dotted name of a class or {words}" if "dot import path" in message else words
+        return f"{_place(head[1], args, files)}: {_joined(given[1])!r} given, expected {words}"
+    if head and (rest := _joined(message[head.end() :])):
+        dashes = "--" if message.startswith("argument --") else ""
+        return f"{dashes + head[1] if dashes else _place(head[1], args, files)}: {rest}"
+    return _joined(message)
+
+
+def nearest_key(key: str, keys: Sequence[str]) -> str | None:
+    """The key that looks most like a wrong one, by difflib's ratio; None if none does.
+
+    A key without its group is compared with the last words.
+
+    Example:
+        >>> nearest_key("modle.lr", ["model.lr", "data.root"]), nearest_key("roots", ["model.lr", "data.root"])
+        ('model.lr', 'data.root')
+    """
+
+    def likeness(other: str) -> float:
+        whole = SequenceMatcher(None, key, other).ratio()
+        return whole if "." in key else max(whole, 0.95 * SequenceMatcher(None, key, other.split(".")[-1]).ratio())
+
+    best = max(keys, key=likeness, default=None)
+    return best if best is not None and likeness(best) >= _NEAR else None
+
+
+def _hint(key: str, keys: Sequence[str], dashes: str = "") -> str:
+    near = nearest_key(key, keys)
+    return f"the nearest is {dashes}{near}" if near else "none is near; see --help"
+
+
+def _place(key: str, args: Sequence[str], files: Sequence[tuple[Path, dict[str, Any], str]]) -> str:
+    """The key, after the file that has it; on the command line, which comes last, with its dashes."""
+    if any(re.fullmatch(rf"--{re.escape(key)}(=.*)?", arg) for arg in args):
+        return f"--{key}"
+    holders = [path for path, values, _ in files if _has(values, key)]
+    return f"{holders[-1]}: {key}" if holders else key
+
+
+def _has(values: Any, key: str) -> bool:
+    if isinstance(values, dict) and key in values:
+        return True
+    first, _, rest = key.partition(".")
+    return isinstance(values, dict) and bool(rest) and _has(values.get(first), rest)
+
+
+def _files(args: Sequence[str]) -> Iterator[tuple[Path, dict[str, Any], str]]:
+    """Each YAML file among the arguments and those that they name: its values, below their group, and its fault."""
+    for option, value in zip(args, [*args[1:], ""], strict=False):
+        name, _, joined = option.partition("=")
+        if name in ("--config", "-c"):
+            yield from _file(Path(joined or value), "")
+        elif re.fullmatch(r"--\w+", name) and (joined or value).endswith((".yaml", ".yml", ".json")):
+            yield from _file(Path(joined or value), name.removeprefix("--"))
+
+
+def _file(path: Path, group: str) -> Iterator[tuple[Path, dict[str, Any], str]]:
+    import yaml
+
+    if not path.is_file():
+        return
+    try:
+        values = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        yield path, {}, _joined(str(error))
+        return
+    yield path, {group: values} if group else values, ""
+    if isinstance(values, dict):
+        for key, value in values.items():
+            if isinstance(value, str) and value.endswith((".yaml", ".yml", ".json")):
+                yield from _file(path.parent / value, key)
+
+
+def _arguments(class_path: str) -> list[str]:
+    module, _, name = class_path.rpartition(".")
+    return [key for key in signature(getattr(import_module(module), name)).parameters if key != "self"]
+
+
+def _joined(text: str) -> str:
+    return " ".join(text.split())

@@ -1,0 +1,225 @@
+"""One config trained and tested over seeds and set-ups, and one table of what came out."""
+
+import argparse
+import csv
+import io
+import json
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import mean, stdev
+from time import perf_counter
+from typing import Any
+
+from torchqm.cli.console import Progress, UserError
+from torchqm.cli.sweep_plan import Run, Sweep, read_sweep, runs_of, word
+
+__all__ = ["fit_and_test", "main", "run_sweep", "write_tables"]
+
+_RESULT, _STARTED = "result.json", "started.json"
+
+_DESCRIPTION = """\
+Train and test a config with each seed, set-up and value of a grid. A run that is finished is
+skipped, so the same command goes on where it was stopped (the run that was stopped begins anew).
+Writes DIR/NAME/ for each run, and DIR/sweep.csv and DIR/sweep.md."""
+
+
+def run_sweep(sweep: Sweep, out: Path, progress: Progress, train: Callable[[Run], dict[str, float]]) -> list[Any]:
+    """Run what is not finished yet.
+
+    Args:
+        sweep: what to run.
+        out: folder of all runs.
+        progress: told of each run.
+        train: trains and tests a run; measured values by name.
+
+    Returns:
+        A dictionary for each run: ``run`` (its name), labels, ``seed``, ``status`` (``done``, or what stopped it),
+        ``seconds`` and the measured values.
+
+    Raises:
+        UserError: a folder has a run with other arguments, or something that is no run.
+    """
+    runs = runs_of(sweep, out)
+    kept = {run.name: _kept(out / run.name, run) for run in runs}
+    waiting = [run.name for run in runs if kept[run.name] is None]
+    rows = []
+    for run in runs:
+        result = kept[run.name]
+        if result is None:
+            number = waiting.index(run.name)
+            folder = out / run.name
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+            _write(folder / _STARTED, {"arguments": list(run.arguments)})
+            progress.listener(run.name, -1.0, number / len(waiting))
+            begin = perf_counter()
+            try:
+                values, status = train(run), "done"
+            except UserError as error:  # such as a loss that is not finite: the other runs may do better
+                values, status = {}, f"failed: {' '.join(str(error).split())}"
+            seconds = perf_counter() - begin
+            result = {"arguments": list(run.arguments), "status": status, "seconds": seconds, "values": values}
+            _write(folder / _RESULT, result)
+            progress.listener(run.name, seconds, (number + 1) / len(waiting))
+        head = {"run": run.name, **run.labels, "seed": run.seed, "status": result["status"]}
+        rows.append(head | {"seconds": round(result["seconds"], 1)} | result["values"])
+    return rows
+
+
+def write_tables(rows: Sequence[Mapping[str, Any]], labels: Sequence[str], out: Path) -> str:
+    """Write ``sweep.csv``, a row for each run, and ``sweep.md``, mean and deviation over seeds; the latter's text."""
+    from torchqm.geometry.files import write_whole
+
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    table = io.StringIO()
+    writer = csv.DictWriter(table, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    values = [name for name in columns if name not in {"run", *labels, "seed", "status"}]
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(word(row.get(label, "")) for label in labels), []).append(row)
+    lines = [[*labels, "seeds", *values], ["---"] * (len(labels) + 1 + len(values))]
+    for point, members in groups.items():
+        done = [row for row in members if row["status"] == "done"]
+        count = f"{len(done)}" if len(done) == len(members) else f"{len(done)} of {len(members)}"
+        lines.append([*point, count, *(_spread([row[name] for row in done if name in row]) for name in values)])
+    text = "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    failed = [f"- {row['run']}: {row['status']}\n" for row in rows if row["status"] != "done"]
+    text += "\n" + "".join(failed) if failed else ""
+    write_whole(out / "sweep.csv", lambda file: file.write(table.getvalue().encode()))
+    write_whole(out / "sweep.md", lambda file: file.write(text.encode()))
+    return text
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; 0 if all runs are done, 1 if some failed, 2 for wrong input, 130 if it was interrupted."""
+    import sys
+
+    arguments = _parser().parse_args(argv)
+    try:
+        rows, labels = _sweep(arguments)
+    except UserError as error:
+        print(f"sweep: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except (KeyboardInterrupt, SystemExit):
+        print("sweep: interrupted; the same command goes on with the runs that are not finished", file=sys.stderr)
+        return 130
+    print(write_tables(rows, labels, arguments.out))
+    return 0 if all(row["status"] == "done" for row in rows) else 1
+
+
+def _sweep(arguments: argparse.Namespace) -> tuple[list[Any], list[str]]:
+    sweep = read_sweep(arguments.sweep) if arguments.sweep else Sweep(_config(arguments))
+    sweep = replace(
+        sweep,
+        seeds=arguments.seeds or sweep.seeds,
+        options={**sweep.options, **dict(arguments.set)},
+        grid={**sweep.grid, **dict(arguments.grid)},
+    )
+    from torchqm.cli.learn import learn
+
+    _quiet()
+    for run in runs_of(replace(sweep, seeds=sweep.seeds[:1]), arguments.out):
+        learn(run.arguments, run=False)  # a wrong key is found before the first run, not after it
+    with Progress() as progress:
+        rows = run_sweep(sweep, arguments.out, progress, fit_and_test)
+    return rows, [*(["setup"] if sweep.setups else []), *sweep.grid]
+
+
+def fit_and_test(run: Run) -> dict[str, float]:
+    """Train, then test the best checkpoint (else the last); what the test logs, without the terms of the loss."""
+    from torchqm.cli.learn import evaluate, fit
+
+    plain = ("--trainer.enable_progress_bar", "false", "--trainer.enable_model_summary", "false")
+    fit([*run.arguments, *plain])
+    folder = Path(run.arguments[run.arguments.index("--trainer.logger.init_args.save_dir") + 1]) / run.name
+    where = ("--trainer.logger.init_args.save_dir", str(folder), "--trainer.logger.init_args.version", "test")
+    tested = evaluate([str(folder), *plain, *where, "--verbose", "false"])
+    found = tested.trainer.callback_metrics
+    return {name: float(value) for name, value in found.items() if not name.startswith("test_l_")}
+
+
+def _quiet() -> None:
+    """Lightning tells of every run what accelerators there are; one line for each run is enough here."""
+    import logging
+    import warnings
+
+    import torchqm.cli.lightning  # noqa: F401 - importing Lightning sets its levels
+
+    for name in ("pytorch_lightning", "lightning_fabric", "lightning.fabric", "lightning.pytorch"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", module=r"pytorch_lightning\..*|jsonargparse.*")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="sweep.py", description=_DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "sweep", type=Path, nargs="?", metavar="SWEEP.yaml", help="config, seeds, options, setups, grid"
+    )
+    parser.add_argument("--config", type=Path, help="instead of SWEEP.yaml: one config of torchqm fit")
+    parser.add_argument("--seeds", type=_seeds, metavar="0,1,2", help="instead of those of SWEEP.yaml; default 0")
+    parser.add_argument(
+        *("--grid", "--set"),
+        dest="both",
+        action=_Options,
+        metavar="KEY=VALUE[,VALUE...]",
+        help="--grid model.k=20,40: run each; --set model.lr=1e-2: for all runs; both as often as needed",
+    )
+    parser.add_argument("--out", type=Path, default=Path("runs/sweep"), metavar="DIR", help="default: %(default)s")
+    parser.set_defaults(grid=[], set=[])
+    return parser
+
+
+class _Options(argparse.Action):
+    """``--grid KEY=A,B`` and ``--set KEY=A``; values are YAML."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option: str | None = None) -> None:
+        import yaml
+
+        key, equals, text = str(values).partition("=")
+        if not key or not equals:
+            parser.error(f"argument {option}: {values!r} given, expected KEY=VALUE")
+        name = str(option).removeprefix("--")
+        value = yaml.safe_load(f"[{text}]") if name == "grid" else yaml.safe_load(text)
+        setattr(namespace, name, [*getattr(namespace, name), (key, value)])
+
+
+def _config(arguments: argparse.Namespace) -> Path:
+    if arguments.config is None:
+        raise UserError("SWEEP.yaml or --config is needed")
+    return Path(arguments.config)
+
+
+def _seeds(text: str) -> list[int]:
+    return [int(word) for word in text.split(",")]
+
+
+def _spread(values: Sequence[float]) -> str:
+    if not values:
+        return ""
+    return f"{mean(values):.4g}" + (f" ± {stdev(values):.2g}" if len(values) > 1 else "")
+
+
+def _kept(folder: Path, run: Run) -> Any:
+    """The result of a finished run, None if it must be run."""
+    if not folder.exists():
+        return None
+    for name in (_RESULT, _STARTED):
+        if (folder / name).is_file():
+            found = json.loads((folder / name).read_text())
+            if found["arguments"] != list(run.arguments):
+                raise UserError(f"{folder}: has a run with other arguments ({name}); give another --out, or remove it")
+            return found if name == _RESULT else None
+    raise UserError(f"{folder}: exists, but is no run of a sweep; give another --out, or remove it")
+
+
+def _write(path: Path, values: Mapping[str, Any]) -> None:
+    from torchqm.geometry.files import write_whole
+
+    text = json.dumps(values, indent=1) + "\n"
+    write_whole(path, lambda file: file.write(text.encode()))

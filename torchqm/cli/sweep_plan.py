@@ -1,0 +1,116 @@
+"""What a sweep runs: a config over seeds, set-ups and a grid of values."""
+
+import itertools
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from torchqm.cli.config_errors import nearest_key
+from torchqm.cli.console import UserError
+
+__all__ = ["Run", "Sweep", "read_sweep", "runs_of", "word"]
+
+_KEYS = ("config", "seeds", "options", "setups", "grid")
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What is run.
+
+    Args:
+        config: YAML file of ``torchqm fit``.
+        seeds: each set-up is trained with all of them.
+        options: of all runs, such as ``{"model.lr": 1e-3}``.
+        setups: name to options of it.
+        grid: option to values; every combination is run.
+    """
+
+    config: Path
+    seeds: Sequence[int] = (0,)
+    options: Mapping[str, Any] = field(default_factory=dict)
+    setups: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    grid: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run: its folder's name, what tells it from the others, and its arguments for ``torchqm fit``."""
+
+    name: str
+    labels: Mapping[str, Any]
+    seed: int
+    arguments: Sequence[str]
+
+
+def read_sweep(path: Path) -> Sweep:
+    """A sweep from a YAML file with the keys ``config`` (from the file's folder on), ``seeds, options, setups, grid``.
+
+    Raises:
+        UserError: an unknown key, or a value of the wrong kind.
+    """
+    import yaml
+
+    try:
+        given = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UserError(f"{path}: not readable as YAML ({' '.join(str(error).split())})") from error
+    if not isinstance(given, dict) or "config" not in given:
+        raise UserError(f"{path}: expected keys and values, among them 'config'")
+    for key in given:
+        if key not in _KEYS:
+            near = nearest_key(str(key), _KEYS)
+            hint = f"the nearest is {near}" if near else f"allowed are {', '.join(_KEYS)}"
+            raise UserError(f"{path}: {key}: no such key; {hint}")
+    groups = {"seeds": list, "options": dict, "setups": dict, "grid": dict}
+    _require(path, given, groups)
+    for group, kind in (("setups", dict), ("grid", list)):
+        own = given.get(group, {})
+        _require(path, own, dict.fromkeys(own, kind), f"{group}.")
+    return Sweep(**{**given, "config": path.parent / given["config"]})
+
+
+def runs_of(sweep: Sweep, out: Path) -> list[Run]:
+    """Every combination; the seed changes last, so that each seed's comparison is whole as early as can be.
+
+    Example:
+        >>> plan = Sweep(Path("a.yaml"), (0, 1), grid={"model.k": [20, 40]})
+        >>> [run.name for run in runs_of(plan, Path("out"))]
+        ['k=20-seed=0', 'k=40-seed=0', 'k=20-seed=1', 'k=40-seed=1']
+    """
+    runs = []
+    setups = sweep.setups or {"": {}}
+    for seed, (setup, own), values in itertools.product(
+        sweep.seeds, setups.items(), itertools.product(*sweep.grid.values())
+    ):
+        point = dict(zip(sweep.grid, values, strict=True))
+        labels = ({"setup": setup} if setup else {}) | point
+        parts = [setup] if setup else []
+        parts += [f"{key.split('.')[-1]}={word(value)}" for key, value in point.items()]
+        name = "-".join([*parts, f"seed={seed}"]).replace("/", "_")
+        options = {**sweep.options, **own, **point, "seed_everything": seed}
+        words = [part for key, value in options.items() for part in (f"--{key}", word(value))]
+        logger = ("--trainer.logger", "torchqm.learn.logger.RunLogger")
+        where = ("--trainer.logger.init_args.save_dir", str(out), "--trainer.logger.init_args.version", name)
+        runs.append(Run(name, labels, seed, ["--config", str(sweep.config), *words, *logger, *where]))
+    if len({run.name for run in runs}) < len(runs):
+        raise UserError("sweep: two runs would have the same name; give each set-up and each value once")
+    return runs
+
+
+def word(value: Any) -> str:
+    """A value as it stands on a command line.
+
+    Example:
+        >>> word("orbit"), word([1, 2]), word(None), word(False)
+        ('orbit', '[1, 2]', 'null', 'false')
+    """
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _require(path: Path, values: Mapping[str, Any], kinds: Mapping[str, type], group: str = "") -> None:
+    for key, kind in kinds.items():
+        if key in values and not isinstance(values[key], kind):
+            wanted = "a list" if kind is list else "a mapping"
+            raise UserError(f"{path}: {group}{key}: {values[key]!r} given, expected {wanted}")
