@@ -21,6 +21,7 @@ from torchqm.matching.shape import N_ANCHORS, PreparedShape
 from torchqm.symmetry.group import SymmetryGroup
 
 __all__ = [
+    "K_CHOICE",
     "SelfMap",
     "best_self_map",
     "conjugate_reflection",

@@ -11,7 +11,14 @@ from torchqm.fmap.refine import growing_sizes, upsample
 from torchqm.matching.described import pair_descriptors
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
 from torchqm.matching.parameters import MatchParameters
-from torchqm.matching.self_map import best_self_map, conjugate_reflection, self_maps_from_halves
+from torchqm.matching.quotient import pair_places
+from torchqm.matching.self_map import (
+    K_CHOICE,
+    best_self_map,
+    conjugate_reflection,
+    self_maps_from_halves,
+    settled_self_map,
+)
 from torchqm.matching.semi_quotient import SemiQuotientMatch, match_semi_quotient, pull_back, sharpen_orbit_map
 from torchqm.matching.shape import PreparedShape
 from torchqm.symmetry.group import SymmetryGroup
@@ -99,15 +106,20 @@ def transfer_symmetry(
     else:
         raise ValueError(f"way={way!r}: allowed are 'clustering' and 'full_map'")
     candidates = [*more, *self_maps_from_halves(x, sign, parameters, pair_descriptors(x, y, parameters))]
-    found = best_self_map(candidates, x, parameters, witness=0 if more else None)
-    basis = x.basis.truncate(found.fmap.shape[0])
-    group = SymmetryGroup.from_reflection(fmap_to_p2p(found.fmap, basis, basis, search=x.search, guide=x.search))
+    settle = way == "full_map" and parameters.refinement == "upsample" and parameters.local_weight > 0
+    at_choice = parameters.changed(k_max=max(parameters.k, min(K_CHOICE, parameters.k_max)))
+    found = best_self_map(candidates, x, at_choice if settle else parameters, witness=0 if more else None)
+    fmap = found.fmap
+    if settle:  # local features would flatter the candidates; one that is chosen they hold in its place
+        fmap = settled_self_map(fmap, x, parameters, pair_places(x, x, parameters)[0])
+    basis = x.basis.truncate(fmap.shape[0])
+    group = SymmetryGroup.from_reflection(fmap_to_p2p(fmap, basis, basis, search=x.search, guide=x.search))
     moved = float(((sign != sign[group.maps[1]]) * x.mesh.vertex_areas).sum())
     if moved < 0.7:
         warnings.append(
             f"the transferred symmetry sends only {moved:.0%} of the area to the other side (nearly all is expected)"
         )
-    return SymmetryTransfer(group, sign, found.fmap, semi, halves, odd, found.scores, warnings)
+    return SymmetryTransfer(group, sign, fmap, semi, halves, odd, found.scores, warnings)
 
 
 def halves_by_clustering(
