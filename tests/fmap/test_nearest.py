@@ -189,3 +189,9 @@ class TestSurfaceSearch:
         search = self.build(shape, 30, 1)
         found = search.nearest(queries, points)
         assert torch.equal(found, search.anchors[nearest_rows(queries, points[search.anchors])])
+
+
+def test_an_offset_of_all_points_costs_no_digits(search):
+    """In single precision the squares of coordinates near 1000 would hide differences of 0.01."""
+    queries, points = 1e3 + 0.01 * noise(200, 6), 1e3 + 0.01 * noise(300, 6, seed=1)
+    assert float((search(queries, points) == dense.nearest_rows(queries, points)).double().mean()) == 1

@@ -44,7 +44,7 @@ def nearest_rows(queries: Float[Tensor, "Q D"], points: Float[Tensor, "P D"]) ->
     if queries.shape[0] * points.shape[0] <= _SMALL:
         # || q - p ||^2 without || q ||^2, which is the same for all points
         return torch.argmax(queries @ points.T - points.square().sum(1) / 2, dim=1)
-    return torch.from_numpy(_blocked(_float32(queries), _float32(points)))
+    return torch.from_numpy(_blocked(queries.detach().numpy(), points.detach().numpy()))
 
 
 def _blocked(
@@ -52,13 +52,16 @@ def _blocked(
 ) -> Shaped[np.ndarray, " Q"]:
     """The largest ``q . p - || p ||^2 / 2`` of each query, the second term as one coordinate more of the product."""
     n, d = queries.shape
+    # What all points have in common is taken off before it costs digits (heat kernel signatures are nearly constant).
+    centre = points[:64].mean(0)
     longer = np.ones((n, d + 1), dtype=np.float32)
-    longer[:, :d] = queries
+    np.subtract(queries, centre, out=longer[:, :d], casting="same_kind")
     best, found = np.full(n, -np.inf, dtype=np.float32), np.zeros(n, dtype=np.int64)
     for start in range(0, len(points), columns):
         part = points[start : start + columns]
         block = np.empty((d + 1, len(part)), dtype=np.float32)
-        block[:d], block[d] = part.T, (part**2).sum(1) / -2
+        np.subtract(part.T, centre[:, None], out=block[:d], casting="same_kind")
+        block[d] = np.einsum("dp,dp->p", block[:d], block[:d]) / -2
         # One range of queries a worker; each range is put together from blocks that stay in the cache.
         chunk = max(rows, -(-n // workers()))
         in_parallel(

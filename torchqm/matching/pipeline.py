@@ -265,7 +265,7 @@ class Collection:
     def _find_own(self, how: str, *shapes: PreparedShape) -> None:
         """:meth:`own_symmetry` of several shapes, at the same time where there are workers."""
         new = [s for s in dict.fromkeys(shapes) if (id(s), how) not in self._symmetries]
-        at_once = len(new) if workers() > 1 else 1
+        at_once = max(1, len(new)) if workers() > 1 else 1
         for start in range(0, len(new), at_once):
             part, known = new[start : start + at_once], list[KnownSymmetry]()
             for number, shape in enumerate(part):
