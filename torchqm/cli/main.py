@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from torchqm.cli import benchmark, data, demo, match, prepare, symmetry
+from torchqm.cli import benchmark, data, demo, export, match, prepare, symmetry
 from torchqm.cli.console import UserError
 from torchqm.cli.threads import set_threads
 from torchqm.version import __version__
@@ -44,7 +44,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"torchqm {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", dest="command", required=True)
-    for module in (demo, match, symmetry, data, prepare, benchmark):
+    for module in (demo, match, symmetry, data, prepare, benchmark, export):
         module.add_parser(commands)
     return parser
 

@@ -76,13 +76,14 @@ class MatchNet(nn.Module):
         self.usual = FunctionalMapLoss(o.w_bij, o.w_orth, o.w_lap)
         self.truth = PointToOrbitLoss(o.truth_form)
         self.split = None if o.setup == "functional_map" else SymmetrizedBasis()
-        self.odd = OrientationDescriptors(o.channels, min(o.odd_pairs, o.channels * (o.channels - 1) // 2))
+        n = self.features.channels
+        self.odd = OrientationDescriptors(n, min(o.odd_pairs, n * (n - 1) // 2))
 
     def forward(self, x: Item, y: Item) -> Matched:
         """Maps between the shapes of two padded batches of :func:`torchqm.data.collate`."""
         with_odd = self.options.setup == "quotient+odd"
         (feat_x, bases_x), (feat_y, bases_y) = (
-            (normalize(self.features(item), dim=-1), bases_of(item, self.split, with_odd)) for item in (x, y)
+            (self.describe(item), bases_of(item, self.split, with_odd)) for item in (x, y)
         )
         if not with_odd:
             return Matched(solved_maps(self.solver, feat_x, feat_y, bases_x, bases_y), feat_x, feat_y)
@@ -90,6 +91,10 @@ class MatchNet(nn.Module):
         maps = solved_maps(self.solver, feat_x, feat_y, bases_x, bases_y, odd_x, odd_y)
         points = (normalize(torch.cat(pair, -1), dim=-1) for pair in ((feat_x, odd_x), (feat_y, odd_y)))
         return Matched(maps, *points)
+
+    def describe(self, item: Item) -> Float[Tensor, "B V C"]:
+        """Features of length one at each vertex of a padded batch: the descriptors that maps are solved from."""
+        return normalize(self.features(item), dim=-1)
 
     def losses(self, batch: Mapping[str, Any], matched: Matched | None = None) -> dict[str, Float[Tensor, ""]]:
         """The terms of the loss by name, weighted; each a mean over the pairs of the batch.

@@ -1,6 +1,7 @@
 """Floor 5: the matchers: quotient, semi-quotient, symmetry transfer, and the pipeline that joins them."""
 
 from torchqm.matching.candidates import FullMap, full_map_from_blocks
+from torchqm.matching.described import Descriptors
 from torchqm.matching.detect import Detection, detect_group
 from torchqm.matching.known import KnownSymmetry, extrinsic_symmetry, given_symmetry, no_symmetry, transferred_symmetry
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
@@ -25,6 +26,7 @@ __all__ = [
     "METHODS",
     "SYMMETRIES",
     "Collection",
+    "Descriptors",
     "Detection",
     "FullMap",
     "KnownSymmetry",

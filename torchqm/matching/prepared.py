@@ -7,6 +7,7 @@ import torch
 from torchqm.fmap.convert import p2p_to_fmap
 from torchqm.fmap.refine import correspondence_fmap
 from torchqm.matching.candidates import full_map_from_blocks
+from torchqm.matching.described import Descriptors, describe_pair
 from torchqm.matching.initial import basis_size
 from torchqm.matching.known import KnownSymmetry, no_symmetry
 from torchqm.matching.orbits import full_map_from_orbits, quotient_size
@@ -46,6 +47,7 @@ def match_prepared(
     method: str = "quotient",
     parameters: MatchParameters | None = None,
     steps: Steps | None = None,
+    descriptors: Descriptors | None = None,
 ) -> MatchResult:
     """Match two prepared shapes with known symmetries; see :func:`match`."""
     parameters = parameters or MatchParameters()
@@ -68,10 +70,14 @@ def match_prepared(
         warnings.append("no symmetry is used: of several equally good maps one comes back, possibly a mixture of them")
     work = x.n_verts / 1000
     oriented = x.oriented and y.oriented
-    separated = None
+    separated, values = None, None
+    if descriptors is not None:
+        with steps("descriptors"):
+            values = describe_pair(x, y, descriptors)
+        details |= {"descriptors": repr(descriptors), "n_descriptors": values[0].shape[1]}
     if method == "semi":
         with steps("semi-quotient matching", COST["quotient"] * work):
-            semi = match_semi_quotient(x, y, known_y.group, parameters)
+            semi = match_semi_quotient(x, y, known_y.group, parameters, values)
             even, p2p, fmap = semi.even, semi.orbit_map, None
             if known_y.known:
                 p2p = choose_halves(p2p, known_y.group, known_x.sign, known_y.sign)
@@ -79,7 +85,7 @@ def match_prepared(
         with steps("quotient matching", COST["quotient"] * work):
             one = known_x.group.order == 1 or (known_x.reflection and known_y.reflection)
             k_used = None if one else quotient_size(known_x.group.order, parameters)
-            found = match_quotient(x, y, known_x.group, known_y.group, parameters, k_used)
+            found = match_quotient(x, y, known_x.group, known_y.group, parameters, k_used, values)
         even = found.fmap
         with steps("point maps and refinement", COST["maps"] * work):
             if not known_x.known:

@@ -65,6 +65,7 @@ def match_quotient(
     group_y: SymmetryGroup,
     parameters: MatchParameters,
     k: int | None = None,
+    values: tuple[Float[Tensor, "Vx C"], Float[Tensor, "Vy C"]] | None = None,
 ) -> QuotientMatch:
     """Algorithm 1 up to the point-to-orbit map: bases of L2+, descriptors, commutativity, least squares, quotient-ICP.
 
@@ -76,6 +77,7 @@ def match_quotient(
         parameters: ``k``, descriptors, ``commutativity``, ``icp_steps``, ``time``, ``n_samples`` are used; with
             ``local_weight`` above 0 curvature is a descriptor, too.
         k: functions instead of ``parameters.k``: of a large group only few of these are symmetric.
+        values: descriptors of both in the place of wave or heat kernel signatures.
 
     References:
         Paper, section 4.3 and 4.4.
@@ -83,7 +85,7 @@ def match_quotient(
     k = basis_size([x.basis, y.basis], parameters.k if k is None else k)
     source = symmetrized_basis(x.basis.truncate(k), group_x)
     target = symmetrized_basis(y.basis.truncate(k), group_y)
-    values_x, values_y = shared_descriptors([x.basis, y.basis], parameters)
+    values_x, values_y = values or shared_descriptors([x.basis, y.basis], parameters)
     more = curvature_descriptors(x, y) if parameters.local_weight > 0 else None
     first = initial_fmap(source.even, target.even, values_x, values_y, parameters.commutativity, more)
     samples, among = x.samples[: parameters.n_samples], target.even.restricted(y.anchors)
