@@ -25,6 +25,7 @@ import torch
 import yaml
 from common import RESULTS, ROOT, write_json
 
+import torchqm.data.datamodule as datamodule
 from torchqm.benchmark.measure import measure_pair
 from torchqm.benchmark.plan import Settings
 from torchqm.cli.learn import fit
@@ -47,6 +48,9 @@ MATCHERS = {
     "matcher, unrefined": MatchParameters(refinement="none", k_quotient=0),
     "matcher": MatchParameters(),
 }
+# Creatures are grown when they are asked for, which takes as long as training: once for all runs, not once for each.
+open_once = datamodule.open_shapes = lru_cache(open_shapes)
+
 Match = Callable[[str, str], torch.Tensor]
 
 
@@ -54,7 +58,7 @@ class Pairs:
     """The test pairs, with what the methods make of their shapes, each computed once."""
 
     def __init__(self, root: str, spec: str, cache: Path, basis_cache: Path) -> None:
-        self.shapes = open_shapes(root)
+        self.shapes = open_once(root)
         self.pairs = choose_pairs(self.shapes, spec)
         self.settings = Settings(root, cache, cache=cache)
         self.basis_cache = basis_cache
@@ -114,7 +118,8 @@ def trained(setup: str, seed: int, out: Path, more: list[str]) -> MatchNet:
     last = folder / "checkpoints" / "last.ckpt"
     logger = {"save_dir": str(out / "runs"), "name": setup, "version": f"seed{seed}"}
     if not (folder / "done").exists():
-        args = ["--config", str(CONFIG), "--model.setup", setup, "--seed_everything", str(seed), *more]
+        args = ["--config", str(CONFIG), "--model.setup", setup, "--seed_everything", str(seed)]
+        args += ["--data.cache_dir", str(out / "cache"), *more]
         args += [part for name, value in logger.items() for part in (f"--trainer.logger.init_args.{name}", value)]
         start = perf_counter()
         fit([*args, *(["--ckpt_path", str(last)] if last.exists() else [])])

@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from torchqm.cli import benchmark, data, demo, export, match, prepare, symmetry
+from torchqm.cli import benchmark, data, demo, export, match, predict, prepare, symmetry
 from torchqm.cli.console import UserError
 from torchqm.cli.threads import set_threads
 from torchqm.version import __version__
@@ -27,6 +27,8 @@ first steps:
   torchqm data check FOLDER                     what a data set holds, and what is wrong with it
   torchqm prepare FOLDER                        eigenfunctions of all its shapes, kept for later runs
   torchqm benchmark FOLDER                      methods compared on its pairs; FOLDER may be 'synthetic:'
+  torchqm match cat3.off cat0.off --checkpoint builtin
+                                                with learned descriptors
 
 'torchqm COMMAND --help' explains a command. Exit status: 0 done, 1 some shapes of a
 data set could not be used (the others were), 2 wrong input (one line on stderr says which
@@ -44,7 +46,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"torchqm {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", dest="command", required=True)
-    for module in (demo, match, symmetry, data, prepare, benchmark, export):
+    for module in (demo, match, symmetry, data, prepare, benchmark, predict, export):
         module.add_parser(commands)
     return parser
 
