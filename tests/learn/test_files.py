@@ -60,12 +60,6 @@ def test_a_run_folder_gives_its_best_checkpoint(run):
         assert net.options.inputs == ("wks", "xyz")
 
 
-def test_what_ships_is_small_and_says_how_it_was_made():
-    path = find_weights("builtin")
-    assert path.stat().st_size < 5e6
-    assert load_net("builtin").options.setup == "quotient+odd"
-
-
 def damaged(path, content):
     path.write_bytes(content)
     return path

@@ -1,0 +1,37 @@
+"""The network that ships: small, says how it was made, and tells more than the features that it is given."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from safetensors import safe_open
+
+from torchqm.data import ItemOptions, PairDataset, collate, open_shapes
+from torchqm.learn import MatchNet, load_net
+from torchqm.learn.files import find_weights
+
+
+def test_it_is_small_and_says_how_it_was_made():
+    path = find_weights("builtin")
+    assert path.stat().st_size < 5e6
+    with safe_open(path, "pt") as file:
+        about = json.loads(file.metadata()["torchqm"])["about"]
+    assert about["config"]["data"]["root"].startswith("synthetic:")
+    assert about["config"]["seed_everything"] == 0
+    assert set(about["versions"]) >= {"torchqm", "torch", "python"}
+
+
+@pytest.mark.parametrize("kind", ["biped", "quadruped"])
+def test_it_beats_wave_kernel_signatures_in_the_same_solver(kind):
+    """On a body, poses and triangulations that it was not trained on; plain errors, as left must stay left."""
+    net = load_net("builtin")
+    wks = MatchNet(replace(net.options, network="none")).eval()
+    shapes = open_shapes(f"synthetic:kinds={kind};poses=2;verts=800;seed=11")
+    options = ItemOptions(keys=(*net.options.keys, "corr"), k=net.options.k, dtype=torch.float32)
+    batch = collate([PairDataset(shapes, "within-class+unordered", options=options)[0]])
+    with torch.no_grad():
+        learned, given = (one.errors(batch, one(batch["first"], batch["second"])) for one in (net, wks))
+    for name in ("plain_error", "orbit_error"):
+        assert float(learned[name]) < float(given[name]), name
+    assert float(learned["flipped_map"]) == 0
