@@ -1,6 +1,8 @@
 """The network that ships: small, says how it was made, and tells more than the features that it is given."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
@@ -20,6 +22,21 @@ def test_it_is_small_and_says_how_it_was_made():
     assert about["config"]["data"]["root"].startswith("synthetic:")
     assert about["config"]["seed_everything"] == 0
     assert set(about["versions"]) >= {"torchqm", "torch", "python"}
+
+
+def test_it_is_used_without_lightning():
+    """Whoever only matches needs none of the extra ``learn``."""
+    script = """
+import sys
+for name in ("pytorch_lightning", "lightning", "jsonargparse"):
+    sys.modules[name] = None  # an import of it is an ImportError
+from torchqm.cli.checkpoint import read_checkpoint
+from torchqm.data.synthetic import creature
+from torchqm.matching import prepare
+print(tuple(read_checkpoint("builtin")(prepare(creature("ellipsoid", 500).mesh, 60)).shape)[1])
+"""
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert run.stdout == "64\n"
 
 
 @pytest.mark.parametrize("kind", ["biped", "quadruped"])
