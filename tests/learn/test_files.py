@@ -35,6 +35,8 @@ def run(tmp_path_factory):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_saved_network_computes_the_same(more, dtype, tmp_path, pairs):
     net = net_of(**more).to(dtype).eval()
+    for parameter in net.parameters():
+        parameter.data += 1e-12  # more than float32 holds
     again = load_net(save_net(net, tmp_path / "net.safetensors"))
     assert again.options == net.options
     assert not again.training
@@ -79,6 +81,13 @@ def test_damaged_files_are_named(run, tmp_path):
     for name, content in bad.items():
         with pytest.raises(ValueError, match=rf"{name}: damaged"):
             load_net(damaged(tmp_path / name, content))
+
+
+def test_a_changed_weight_is_noticed(tmp_path):
+    content = bytearray(save_net(net_of(), tmp_path / "net.safetensors").read_bytes())
+    content[-40] ^= 1
+    with pytest.raises(ValueError, match=r"flipped\.safetensors: damaged: its weights are not those"):
+        load_net(damaged(tmp_path / "flipped.safetensors", bytes(content)))
 
 
 class Evil:

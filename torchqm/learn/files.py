@@ -28,6 +28,9 @@ FORMAT = 1
 _KEY = "torchqm"  # one entry of metadata: the order of several would differ from file to file
 _PREFIX = "net."  # of the network inside a MatchModule
 
+_Read = tuple[dict[str, Any], dict[str, Tensor], str | None]
+"""Options, weights, and the digest that they were written with."""
+
 
 def save_net(net: MatchNet, path: str | Path, about: Mapping[str, Any] | None = None) -> Path:
     """Write a network to one safetensors file, whole or not at all; equal networks give equal files.
@@ -46,7 +49,13 @@ def save_net(net: MatchNet, path: str | Path, about: Mapping[str, Any] | None = 
     path = Path(path)
     if path.suffix != SUFFIX:
         raise ValueError(f"{path}: a trained network is written to a file that ends with {SUFFIX}")
-    head = {"format": FORMAT, "version": __version__, "options": _plain(net.options), "about": dict(about or {})}
+    head = {
+        "format": FORMAT,
+        "version": __version__,
+        "options": _plain(net.options),
+        "digest": digest(net),
+        "about": dict(about or {}),
+    }
     tensors = {name: value.detach().cpu().contiguous() for name, value in net.state_dict().items()}
     content = save(tensors, {_KEY: json.dumps(head, sort_keys=True)})
     return write_whole(path, lambda file: file.write(content))
@@ -72,7 +81,7 @@ def load_net(path: str | Path) -> MatchNet:
         (True, 8)
     """
     path = find_weights(path)
-    values, state = _read(path) if path.suffix == SUFFIX else _read_checkpoint(path)
+    values, state, written = _read(path) if path.suffix == SUFFIX else _read_checkpoint(path)
     unknown = sorted(set(values) - {field.name for field in fields(NetOptions)})
     if unknown:
         raise ValueError(f"{path}: has options that this version of torchqm does not know: {', '.join(unknown)}")
@@ -85,8 +94,13 @@ def load_net(path: str | Path) -> MatchNet:
     if faults:
         more = f" and {len(faults) - 4} more" if len(faults) > 4 else ""
         raise ValueError(f"{path}: weights of another architecture than its options say: {'; '.join(faults[:4])}{more}")
+    net.to(
+        next((v.dtype for v in state.values() if v.is_floating_point()), torch.float32)
+    )  # before: nothing is rounded
     net.load_state_dict(state)
-    return net.to(next((v.dtype for v in state.values() if v.is_floating_point()), torch.float32)).eval()
+    if written is not None and digest(net) != written:
+        raise ValueError(f"{path}: damaged: its weights are not those that it was written with")
+    return net.eval()
 
 
 def find_weights(path: str | Path) -> Path:
@@ -126,7 +140,7 @@ def _plain(options: NetOptions) -> dict[str, Any]:
     return {name: list(v) if isinstance(v, list | tuple) else v for name, v in asdict(options).items()}
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def _read(path: Path) -> _Read:
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -142,10 +156,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
             raise ValueError(f"{path}: of format {about['format']!r}; this version of torchqm reads {FORMAT}")
     except (json.JSONDecodeError, TypeError, KeyError) as error:
         raise ValueError(f"{path}: safetensors, but no network of torchqm: its metadata has no options") from error
-    return options, state
+    return options, state, about.get("digest")
 
 
-def _read_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def _read_checkpoint(path: Path) -> _Read:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except UnpicklingError as error:
@@ -162,8 +176,8 @@ def _read_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         raise ValueError(
             f"{path}: no checkpoint of torchqm.learn.MatchModule: its hyperparameters are those of another"
         )
-    state = content["state_dict"]
-    return options, {name.removeprefix(_PREFIX): value for name, value in state.items() if name.startswith(_PREFIX)}
+    state = {name: value for name, value in content["state_dict"].items() if name.startswith(_PREFIX)}
+    return options, {name.removeprefix(_PREFIX): value for name, value in state.items()}, None
 
 
 def _differences(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> list[str]:
