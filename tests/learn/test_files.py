@@ -8,7 +8,7 @@ from safetensors.torch import load_file, save_file
 
 from torchqm.data import collate
 from torchqm.learn import MatchModule, MatchNet, NetOptions, load_net, save_net
-from torchqm.learn.files import digest, find_weights
+from torchqm.learn.files import _digest, digest, find_weights
 
 SMALL = {"k": 20, "signature": 16, "channels": 12, "width": 24, "odd_pairs": 20}
 
@@ -88,6 +88,15 @@ def test_a_changed_weight_is_noticed(tmp_path):
     content[-40] ^= 1
     with pytest.raises(ValueError, match=r"flipped\.safetensors: damaged: its weights are not those"):
         load_net(damaged(tmp_path / "flipped.safetensors", bytes(content)))
+
+
+def test_a_file_that_knows_fewer_options_is_read_with_their_defaults(tmp_path):
+    """As one of an earlier version would be; its weights are still checked."""
+    path, net = tmp_path / "early.safetensors", net_of()
+    options = {**SMALL, "setup": "quotient+odd"}
+    head = {"format": 1, "options": options, "digest": _digest(options, net.state_dict())}
+    save_file(net.state_dict(), path, {"torchqm": json.dumps(head)})
+    assert load_net(path).options == net.options
 
 
 class Evil:

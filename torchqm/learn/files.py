@@ -49,13 +49,8 @@ def save_net(net: MatchNet, path: str | Path, about: Mapping[str, Any] | None = 
     path = Path(path)
     if path.suffix != SUFFIX:
         raise ValueError(f"{path}: a trained network is written to a file that ends with {SUFFIX}")
-    head = {
-        "format": FORMAT,
-        "version": __version__,
-        "options": _plain(net.options),
-        "digest": digest(net),
-        "about": dict(about or {}),
-    }
+    head = {"format": FORMAT, "version": __version__, "options": _plain(net.options), "digest": digest(net)}
+    head["about"] = dict(about or {})
     tensors = {name: value.detach().cpu().contiguous() for name, value in net.state_dict().items()}
     content = save(tensors, {_KEY: json.dumps(head, sort_keys=True)})
     return write_whole(path, lambda file: file.write(content))
@@ -90,16 +85,16 @@ def load_net(path: str | Path) -> MatchNet:
         net = MatchNet(NetOptions(**given))
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: its options make no network: {error}") from error
+    # Of what the file has, not of the network: later versions may know more options.
+    if written is not None and _digest(values, state) != written:
+        raise ValueError(f"{path}: damaged: its weights are not those that it was written with")
     faults = _differences(net.state_dict(), state)
     if faults:
         more = f" and {len(faults) - 4} more" if len(faults) > 4 else ""
         raise ValueError(f"{path}: weights of another architecture than its options say: {'; '.join(faults[:4])}{more}")
-    net.to(
-        next((v.dtype for v in state.values() if v.is_floating_point()), torch.float32)
-    )  # before: nothing is rounded
+    # In the precision of the file before anything is copied, so that nothing is rounded.
+    net.to(next((v.dtype for v in state.values() if v.is_floating_point()), torch.float32))
     net.load_state_dict(state)
-    if written is not None and digest(net) != written:
-        raise ValueError(f"{path}: damaged: its weights are not those that it was written with")
     return net.eval()
 
 
@@ -128,8 +123,12 @@ def find_weights(path: str | Path) -> Path:
 
 def digest(net: MatchNet) -> str:
     """SHA-256 of all that a network computes with: its options and its weights, not where or how they are kept."""
-    found = hashlib.sha256(json.dumps(_plain(net.options), sort_keys=True).encode())
-    for name, value in sorted(net.state_dict().items()):
+    return _digest(_plain(net.options), net.state_dict())
+
+
+def _digest(options: Mapping[str, Any], state: Mapping[str, Tensor]) -> str:
+    found = hashlib.sha256(json.dumps(options, sort_keys=True).encode())
+    for name, value in sorted(state.items()):
         array = value.detach().cpu().contiguous()
         found.update(f"{name} {array.dtype} {tuple(array.shape)};".encode())
         found.update(array.numpy().tobytes())
