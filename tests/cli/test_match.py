@@ -230,3 +230,43 @@ def test_interrupt_leaves_nothing(pair, tmp_path, monkeypatch):
     monkeypatch.setattr("torchqm.matching.match", interrupt)
     assert run(pair, tmp_path) == 130
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    from torchqm.learn import MatchNet, NetOptions, save_net
+
+    torch.manual_seed(0)
+    net = MatchNet(NetOptions(k=30, signature=32, channels=32, width=32))
+    return save_net(net, tmp_path_factory.mktemp("net") / "net.safetensors")
+
+
+def test_a_checkpoint_gives_the_descriptors(pair, tmp_path, learned):
+    from torchqm.learn import LearnedDescriptors, load_net
+
+    assert run(pair, tmp_path, "--checkpoint", learned) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["details"]["descriptors"] == repr(LearnedDescriptors(load_net(learned)))
+    assert summary["details"]["n_descriptors"] == 32
+    assert summary["arguments"]["checkpoint"] == str(learned)
+    _, copy = pair
+    with np.load(tmp_path / "out" / "match.npz", allow_pickle=False) as saved:
+        found = torch.from_numpy(saved["maps"])[0]
+    verts = copy.shape.mesh.verts
+    assert float((verts[found] - verts[copy.p2p_xy]).norm(dim=1).mean()) / copy.shape.mesh.area**0.5 < 0.02
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--checkpoint", "none.ckpt"), "none.ckpt: no such file or run folder"),
+        (("--checkpoint", "x.off"), "x.off: a trained network is a .safetensors or a .ckpt"),
+        (("--checkpoint", "LEARNED", "--descriptor", "hks"), "--checkpoint takes the place of --descriptor hks"),
+        (("--checkpoint", "LEARNED", "--k-max", "29", "--k", "20"), "29 eigenfunctions are there, and the network was"),
+    ],
+)
+def test_checkpoints_that_cannot_be_used_are_named(pair, tmp_path, capsys, learned, options, message):
+    given = [learned if option == "LEARNED" else option for option in options]
+    assert run(pair, tmp_path, *given) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

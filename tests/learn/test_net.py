@@ -5,6 +5,7 @@ import torch
 
 from torchqm.data import collate
 from torchqm.learn import MatchNet, NetOptions
+from torchqm.nn import InputFeatures
 
 SMALL = {"k": 20, "signature": 16, "channels": 12, "width": 24, "odd_pairs": 20}
 KINDS = [
@@ -179,3 +180,14 @@ def test_mixed_losses_agree_within_the_rounding_of_linear_layers(setup, supervis
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
         mixed = sum(net.losses(batch).values())
     assert 0 < (mixed - loss).abs() <= bound < 0.1 * loss
+
+
+def test_without_a_network_the_features_are_the_inputs_and_the_rest_is_the_same(pairs):
+    net, batch = net_of("quotient+odd", network="none"), collate(pairs)
+    assert not list(net.parameters())
+    inputs = InputFeatures(("wks",), 16, 20).double()
+    values = inputs(batch["first"])
+    torch.testing.assert_close(net.describe(batch["first"]), torch.nn.functional.normalize(values, dim=-1))
+    errors = net.errors(batch, net(batch["first"], batch["second"]))
+    assert errors["flipped_map"].sum() == 0
+    assert errors["plain_error"].max() < 0.1

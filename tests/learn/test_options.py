@@ -12,7 +12,7 @@ from torchqm.learn import MatchModule, NetOptions
         ({"setup": "quotients"}, "setup: 'quotients' given, allowed are functional_map, quotient, quotient\\+odd"),
         ({"supervision": "full"}, "supervision: 'full' given"),
         ({"truth_form": "distance"}, "truth_form: 'distance' given"),
-        ({"network": "gnn"}, "network: 'gnn' given, allowed are mlp, diffusion"),
+        ({"network": "gnn"}, "network: 'gnn' given, allowed are mlp, diffusion, none"),
         ({"k": 0}, "k: 0 given"),
         ({"channels": 1}, "channels: 1 given"),
         ({"tau": 0.0}, "tau: 0.0 given"),

@@ -18,11 +18,15 @@ from torchqm.benchmark.ledger import FORMAT, file_name
 from torchqm.data.base import ShapeSet, Truth, TruthError
 from torchqm.data.published import PUBLISHED_METHODS
 from torchqm.evaluate.metrics import SurfacePoints
+from torchqm.learn import LearnedDescriptors, load_net
 from torchqm.matching.baselines import MATCHERS, Matcher, Ours
 from torchqm.matching.parameters import MatchParameters
 from torchqm.version import __version__
 
 __all__ = ["PUBLISHED", "Settings", "Task", "choose_methods", "functions_of", "parameters_of", "plan_tasks"]
+
+LEARNED = "learned:"
+"""What the name of a method begins with that takes its descriptors from a trained network; its files come after it."""
 
 PUBLISHED = "published:"
 """What the name of a method begins with whose published results are read."""
@@ -82,8 +86,11 @@ class Task:
 def choose_methods(names: Iterable[str]) -> tuple[list[Matcher], list[str]]:
     """The matchers of some names, and the published methods among them (without ``published:``).
 
+    ``learned:RUN`` is ``quotient`` with the descriptors of a trained network (:func:`torchqm.learn.load_net`).
+
     Raises:
-        ValueError: an unknown name (the known ones are listed), one that stands there twice, or none.
+        ValueError: an unknown name (the known ones are listed), one that stands there twice, or none; a file of a
+            trained network that cannot be used.
 
     Example:
         >>> matchers, published = choose_methods(["descriptors", "published:BlendedMap"])
@@ -97,14 +104,29 @@ def choose_methods(names: Iterable[str]) -> tuple[list[Matcher], list[str]]:
         seen.add(name)
         if name.startswith(PUBLISHED):
             published.append(name.removeprefix(PUBLISHED))
+        elif name.startswith(LEARNED):
+            matchers.append(_learned(name))
         elif name in MATCHERS:
             matchers.append(MATCHERS[name])
         else:
-            known = [*MATCHERS, *(PUBLISHED + method for method in PUBLISHED_METHODS)]
+            known = [*MATCHERS, f"{LEARNED}RUN", *(PUBLISHED + method for method in PUBLISHED_METHODS)]
             raise ValueError(f"method {name!r}: unknown; allowed are {', '.join(known)}")
     if not seen:
         raise ValueError(f"methods: at least one is needed; allowed are {', '.join(MATCHERS)}")
     return matchers, published
+
+
+def _learned(name: str) -> Matcher:
+    """The classical matcher with learned descriptors; what it is called says where they were read, once."""
+    path = name.removeprefix(LEARNED)
+    if not path:
+        raise ValueError(f"method {name!r}: a run folder, a file or 'builtin' is expected after {LEARNED!r}")
+    descriptors = LearnedDescriptors(load_net(path))
+    k = descriptors.net.options.k
+    parameters = MatchParameters.of("quotient")
+    if k > parameters.k_max:
+        parameters = parameters.changed(k_max=k)
+    return Ours(parameters=parameters, name=name, descriptors=descriptors)
 
 
 def parameters_of(matcher: Ours) -> MatchParameters:
@@ -173,6 +195,9 @@ def plan_tasks(
 def _config(matcher: Matcher, settings: Settings) -> dict[str, Any]:
     """What the results of a method depend on beside the shapes."""
     numbers = repr(parameters_of(matcher)) if isinstance(matcher, Ours) else ""
+    learned = matcher.descriptors if isinstance(matcher, Ours) else None
+    # Named only where there are some, so that results of all other methods stay what they were.
+    more = {} if learned is None else {"descriptors": repr(learned)}
     return {
         "format": FORMAT,
         "version": __version__,
@@ -181,6 +206,7 @@ def _config(matcher: Matcher, settings: Settings) -> dict[str, Any]:
         "functions": functions_of(matcher),
         "points": settings.points,
         "solver": settings.solver,
+        **more,
     }
 
 

@@ -154,7 +154,8 @@ def _side(shapes: ShapeSet, cls: str, group: SymmetryGroup) -> Tensor | None:
 
 
 def _collection(task: Task, matcher: Ours) -> KeptCollection:
-    return KeptCollection(task.settings.out / "symmetries", matcher.method, parameters_of(matcher))
+    folder = task.settings.out / "symmetries"
+    return KeptCollection(folder, matcher.method, parameters_of(matcher), matcher.descriptors)
 
 
 def _pair(task: Task) -> dict[str, Any]:

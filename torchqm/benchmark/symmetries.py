@@ -16,6 +16,7 @@ from torchqm.benchmark.ledger import file_name
 from torchqm.geometry.files import write_whole
 from torchqm.matching.baselines import BaselineResult, Given, Ours
 from torchqm.matching.known import KnownSymmetry
+from torchqm.matching.outside import Descriptors
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.pipeline import Collection
 from torchqm.matching.shape import PreparedShape
@@ -71,10 +72,13 @@ class KeptCollection(Collection):
         folder: where the files are.
         method: one of :data:`torchqm.matching.pipeline.METHODS`.
         parameters: of the method.
+        descriptors: see :func:`torchqm.matching.match`; symmetries do not depend on them.
     """
 
-    def __init__(self, folder: Path, method: str, parameters: MatchParameters) -> None:
-        super().__init__(None, method, parameters)
+    def __init__(
+        self, folder: Path, method: str, parameters: MatchParameters, descriptors: Descriptors | None = None
+    ) -> None:
+        super().__init__(None, method, parameters, descriptors=descriptors)
         self.folder = folder
         self.symmetry_seconds = 0.0
         self._read_seconds = 0.0

@@ -18,6 +18,8 @@ methods or pairs can be added later. A pair that fails is a row with its reason.
 _EPILOG = """\
 methods:
 {methods}
+  learned:RUN              quotient with the descriptors of a trained network: a run folder,
+                           a .ckpt, a .safetensors of 'torchqm export', or 'builtin'
   published:NAME           others' results in the set's own files (SCB): {published}
 
 pairs:

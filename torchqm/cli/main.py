@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from torchqm.cli import benchmark, data, demo, match, prepare, symmetry, training
+from torchqm.cli import benchmark, data, demo, export, match, predict, prepare, symmetry, training
 from torchqm.cli.console import UserError
 from torchqm.cli.threads import set_threads
 from torchqm.version import __version__
@@ -29,6 +29,8 @@ first steps:
   torchqm benchmark FOLDER                      methods compared on its pairs; FOLDER may be 'synthetic:'
   torchqm fit --config FILE                     train a matcher (needs torchqm[learn])
   torchqm test RUN                              test it
+  torchqm match cat3.off cat0.off --checkpoint builtin
+                                                with learned descriptors
 
 'torchqm COMMAND --help' explains a command. Exit status: 0 done, 1 some shapes of a
 data set could not be used (the others were), 2 wrong input (one line on stderr says which
@@ -46,7 +48,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"torchqm {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", dest="command", required=True)
-    for module in (demo, match, symmetry, data, prepare, benchmark, training):
+    for module in (demo, match, symmetry, data, prepare, benchmark, training, predict, export):
         module.add_parser(commands)
     return parser
 

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchqm.cli.checkpoint import add_checkpoint, read_checkpoint
 from torchqm.cli.console import Progress, UserError, format_table, print_seconds, print_warnings
 from torchqm.cli.folder import staged_folder
 from torchqm.cli.inputs import (
@@ -81,6 +82,7 @@ def add_parser(commands: Any) -> None:
         help="quotient (default): what measured best; paper: sections 4 to 7, its parameters; semi: section 5 alone",
     )
     parser.add_argument("--no-picture", action="store_true", help="do not draw match.png")
+    add_checkpoint(parser)
     add_cache(parser)
     add_threads(parser)
     add_parameters(parser)
@@ -89,6 +91,8 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Match two files and write the results."""
+    if arguments.checkpoint is not None and arguments.descriptor is not None:
+        raise UserError(f"--checkpoint takes the place of --descriptor {arguments.descriptor}; give one of the two")
     if arguments.symmetry == "none" and arguments.symmetry_source is not None:
         raise UserError("--symmetry none uses no symmetry, so --symmetry-source cannot be given with it")
     with staged_folder(arguments.out, FILES) as stage, Progress() as progress:
@@ -96,6 +100,7 @@ def run(arguments: argparse.Namespace) -> None:
         from torchqm.matching.pipeline import SYMMETRIES
 
         parameters = make_parameters(arguments)
+        descriptors = read_checkpoint(arguments.checkpoint)
         seen: dict[Path, Mesh] = {}
         source, target = read_mesh(arguments.source, seen), read_mesh(arguments.target, seen)
         reference = None if arguments.reference is None else read_mesh(arguments.reference, seen)
@@ -121,6 +126,7 @@ def run(arguments: argparse.Namespace) -> None:
                 parameters=parameters,
                 listener=progress.listener,
                 cache_dir=arguments.cache,
+                descriptors=descriptors,
             )
         result.warnings[:0] = notes
         write_match(stage, result, source, target, progress, as_plain(arguments), not arguments.no_picture)

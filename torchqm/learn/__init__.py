@@ -5,13 +5,15 @@
 
 from typing import TYPE_CHECKING, Any
 
+from torchqm.learn.describe import LearnedDescriptors
+from torchqm.learn.files import load_net, save_net
 from torchqm.learn.net import MatchNet
 from torchqm.learn.options import NetOptions
 
 if TYPE_CHECKING:
     from torchqm.learn.module import MatchModule as MatchModule
 
-__all__ = ["MatchModule", "MatchNet", "NetOptions"]
+__all__ = ["LearnedDescriptors", "MatchModule", "MatchNet", "NetOptions", "load_net", "save_net"]
 
 
 def __getattr__(name: str) -> Any:

@@ -13,7 +13,7 @@ __all__ = ["FeatureNet"]
 
 
 class FeatureNet(nn.Module):
-    """:class:`torchqm.nn.InputFeatures` and an :class:`~torchqm.nn.MLP` or a :class:`~torchqm.nn.DiffusionNet`.
+    """:class:`torchqm.nn.InputFeatures` and :class:`~torchqm.nn.MLP`, :class:`~torchqm.nn.DiffusionNet` or nothing.
 
     Args:
         options: ``inputs``, ``network``, ``channels`` and so on.
@@ -27,10 +27,11 @@ class FeatureNet(nn.Module):
         super().__init__()
         o = options
         self.inputs = InputFeatures(o.inputs, o.signature, o.k)
-        self.net: MLP | DiffusionNet
+        self.net: MLP | DiffusionNet | None = None
+        self.channels = self.inputs.channels if o.network == "none" else o.channels
         if o.network == "mlp":
             self.net = MLP(self.inputs.channels, o.channels, (o.width,) * o.blocks, dropout=o.dropout)
-        else:
+        elif o.network == "diffusion":
             self.net = DiffusionNet(
                 *(self.inputs.channels, o.channels, o.width, o.blocks),
                 dropout=o.dropout,
@@ -40,7 +41,9 @@ class FeatureNet(nn.Module):
 
     def forward(self, item: Mapping[str, Any]) -> Float[Tensor, "B V C"]:
         """``(B, V, channels)`` of a padded batch of :func:`torchqm.data.collate`; 0 at padding."""
-        given = self.inputs(item)
+        given: Tensor = self.inputs(item)
+        if self.net is None:
+            return given
         if isinstance(self.net, MLP):
             return self.net(given, item["verts_mask"])
         operators = {key: item[key] for key in ("evals", "evecs", "gradX", "gradY") if key in item}

@@ -41,7 +41,7 @@ class MatchModule(LightningModule):
         inputs: names of input features.
         signature: energies of a wave kernel signature, times of a heat kernel signature.
         k: eigenfunctions of the bases.
-        network: ``mlp`` or ``diffusion``.
+        network: ``mlp``, ``diffusion`` or ``none`` (to test what the input features alone do).
         channels: of the features.
         width: channels inside the network.
         blocks: of ``diffusion``; hidden layers of ``mlp``.

@@ -76,13 +76,14 @@ class MatchNet(nn.Module):
         self.usual = FunctionalMapLoss(o.w_bij, o.w_orth, o.w_lap)
         self.truth = PointToOrbitLoss(o.truth_form)
         self.split = None if o.setup == "functional_map" else SymmetrizedBasis()
-        self.odd = OrientationDescriptors(o.channels, min(o.odd_pairs, o.channels * (o.channels - 1) // 2))
+        n = self.features.channels
+        self.odd = OrientationDescriptors(n, min(o.odd_pairs, n * (n - 1) // 2))
 
     def forward(self, x: Item, y: Item) -> Matched:
         """Maps between the shapes of two padded batches of :func:`torchqm.data.collate`."""
-        given_x, given_y = (self.features(item).to(item["mass"].dtype) for item in (x, y))
+        feat_x, feat_y = self.describe(x), self.describe(y)
         with _whole_precision(x):
-            return self._matched(x, y, normalize(given_x, dim=-1), normalize(given_y, dim=-1))
+            return self._matched(x, y, feat_x, feat_y)
 
     def _matched(self, x: Item, y: Item, feat_x: Tensor, feat_y: Tensor) -> Matched:
         with_odd = self.options.setup == "quotient+odd"
@@ -93,6 +94,10 @@ class MatchNet(nn.Module):
         maps = solved_maps(self.solver, feat_x, feat_y, bases_x, bases_y, odd_x, odd_y)
         points = (normalize(torch.cat(pair, -1), dim=-1) for pair in ((feat_x, odd_x), (feat_y, odd_y)))
         return Matched(maps, *points)
+
+    def describe(self, item: Item) -> Float[Tensor, "B V C"]:
+        """Features of length one at each vertex of a padded batch: the descriptors that maps are solved from."""
+        return normalize(self.features(item).to(item["mass"].dtype), dim=-1)
 
     def losses(self, batch: Mapping[str, Any], matched: Matched | None = None) -> dict[str, Float[Tensor, ""]]:
         """The terms of the loss by name, weighted; each a mean over the pairs of the batch.

@@ -7,7 +7,7 @@ __all__ = ["NETWORKS", "SETUPS", "SUPERVISIONS", "NetOptions"]
 
 SETUPS = ("functional_map", "quotient", "quotient+odd")
 SUPERVISIONS = ("none", "orbit", "plain")
-NETWORKS = ("mlp", "diffusion")
+NETWORKS = ("mlp", "diffusion", "none")
 _TRUTH_FORMS = ("spectral", "assignment")
 
 
@@ -24,7 +24,7 @@ class NetOptions:
         inputs: names of :class:`torchqm.nn.InputFeatures`.
         signature: energies of a wave kernel signature, times of a heat kernel signature.
         k: eigenfunctions of the bases that will be given.
-        network: ``mlp`` or ``diffusion``.
+        network: ``mlp``, ``diffusion`` or ``none``: the input features as they are, to compare with.
         channels: of the features.
         width: channels inside the network.
         blocks: of ``diffusion``; hidden layers of ``mlp``.

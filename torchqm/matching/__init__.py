@@ -4,6 +4,7 @@ from torchqm.matching.candidates import FullMap, full_map_from_blocks
 from torchqm.matching.detect import Detection, detect_group
 from torchqm.matching.known import KnownSymmetry, extrinsic_symmetry, given_symmetry, no_symmetry, transferred_symmetry
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
+from torchqm.matching.outside import Descriptors
 from torchqm.matching.parameters import MatchError, MatchParameters
 from torchqm.matching.pipeline import (
     METHODS,
@@ -25,6 +26,7 @@ __all__ = [
     "METHODS",
     "SYMMETRIES",
     "Collection",
+    "Descriptors",
     "Detection",
     "FullMap",
     "KnownSymmetry",

@@ -20,6 +20,7 @@ from torchqm.matching.known import (
     no_symmetry,
     transferred_symmetry,
 )
+from torchqm.matching.outside import Descriptors
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.prepared import COST, DETECTION, match_prepared
 from torchqm.matching.quality import commutativity_score, orientation_agreement
@@ -48,6 +49,7 @@ def match(
     parameters: MatchParameters | None = None,
     listener: StepListener | None = None,
     cache_dir: str | Path | None = None,
+    descriptors: Descriptors | None = None,
 ) -> MatchResult:
     """All the equally good dense maps from one shape to another.
 
@@ -69,6 +71,8 @@ def match(
         parameters: numbers of the method; by default those that belong to ``method``.
         listener: told of each step; see :data:`torchqm.matching.steps.StepListener`.
         cache_dir: folder of eigenpairs; see :func:`torchqm.matching.shape.prepare`.
+        descriptors: makes the descriptors of a shape in the place of wave kernel signatures, such as
+            :class:`torchqm.learn.LearnedDescriptors`. Symmetries are found without them.
 
     Returns:
         The maps, source vertex to target vertex, with labels, scores, functional maps, warnings and timings.
@@ -81,7 +85,7 @@ def match(
     References:
         Paper, Algorithm 1 and sections 5 to 7.
     """
-    collection = Collection(reference, method, parameters, listener, cache_dir)
+    collection = Collection(reference, method, parameters, listener, cache_dir, descriptors)
     return collection.match(source, target, symmetry, symmetry_source)
 
 
@@ -167,6 +171,7 @@ class Collection:
         parameters: by default those of the method.
         listener: told of each step.
         cache_dir: folder of eigenpairs; see :func:`torchqm.matching.shape.prepare`.
+        descriptors: see :func:`match`.
     """
 
     def __init__(
@@ -176,11 +181,12 @@ class Collection:
         parameters: MatchParameters | None = None,
         listener: StepListener | None = None,
         cache_dir: str | Path | None = None,
+        descriptors: Descriptors | None = None,
     ) -> None:
         if method not in METHODS:
             raise ValueError(f"method={method!r}: allowed are {', '.join(METHODS)}")
         self.method = method
-        self.cache_dir = cache_dir
+        self.cache_dir, self.descriptors = cache_dir, descriptors
         self.parameters = parameters or MatchParameters.of(method)
         self.steps = Steps(listener=listener)
         self.way = "full_map" if method == "quotient" else "clustering"
@@ -329,7 +335,7 @@ class Collection:
             self.shape(self._reference)  # eigenpairs use all threads
         with one_thread():
             known_x, known_y = self._both(x, y, symmetry, symmetry_source)
-            result = match_prepared(x, y, known_x, known_y, self.method, self.parameters, self.steps)
+            result = match_prepared(x, y, known_x, known_y, self.method, self.parameters, self.steps, self.descriptors)
         return replace(result, seconds=self.steps.since(earlier))
 
     def _both(

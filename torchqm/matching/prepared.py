@@ -14,6 +14,7 @@ from torchqm.matching.candidates import full_map_from_blocks
 from torchqm.matching.initial import basis_size
 from torchqm.matching.known import KnownSymmetry, no_symmetry
 from torchqm.matching.orbits import full_map_from_orbits, quotient_size
+from torchqm.matching.outside import Descriptors, describe_pair
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.quality import commutativity_score, map_label, orientation_agreement
 from torchqm.matching.quotient import (
@@ -50,6 +51,7 @@ def match_prepared(
     method: str = "quotient",
     parameters: MatchParameters | None = None,
     steps: Steps | None = None,
+    descriptors: Descriptors | None = None,
 ) -> MatchResult:
     """Match two prepared shapes with known symmetries; see :func:`match`."""
     parameters = parameters or MatchParameters()
@@ -73,11 +75,15 @@ def match_prepared(
     work = x.n_verts / 1000
     curved = parameters.local_weight > 0
     oriented = x.oriented and y.oriented
-    separated = None
+    separated, values = None, None
+    if descriptors is not None:
+        with steps("descriptors"):
+            values = describe_pair(x, y, descriptors)
+        details |= {"descriptors": repr(descriptors), "n_descriptors": values[0].shape[1]}
     if method == "semi":
         with steps("semi-quotient matching", COST["quotient"] * work):
             complete((x, y), False)
-            semi = match_semi_quotient(x, y, known_y.group, parameters)
+            semi = match_semi_quotient(x, y, known_y.group, parameters, values)
             even, p2p, fmap = semi.even, semi.orbit_map, None
             if known_y.known:
                 p2p = choose_halves(p2p, known_y.group, known_x.sign, known_y.sign)
@@ -86,7 +92,7 @@ def match_prepared(
             complete((x, y), curved)
             one = known_x.group.order == 1 or (known_x.reflection and known_y.reflection)
             k_used = None if one else quotient_size(known_x.group.order, parameters)
-            found = match_quotient(x, y, known_x.group, known_y.group, parameters, k_used)
+            found = match_quotient(x, y, known_x.group, known_y.group, parameters, k_used, values)
         even = found.fmap
         with steps("point maps and refinement", COST["maps"] * work):
             if not known_x.known:

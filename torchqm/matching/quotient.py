@@ -71,6 +71,7 @@ def match_quotient(
     group_y: SymmetryGroup,
     parameters: MatchParameters,
     k: int | None = None,
+    values: tuple[Float[Tensor, "Vx C"], Float[Tensor, "Vy C"]] | None = None,
 ) -> QuotientMatch:
     """Algorithm 1 up to the point-to-orbit map: bases of L2+, descriptors, commutativity, least squares, quotient-ICP.
 
@@ -82,6 +83,7 @@ def match_quotient(
         parameters: ``k``, descriptors, ``commutativity``, ``icp_steps``, ``time``, ``n_samples`` are used; with
             ``local_weight`` above 0 curvature is a descriptor, too.
         k: functions instead of ``parameters.k``: of a large group only few of these are symmetric.
+        values: descriptors of both in the place of wave or heat kernel signatures.
 
     References:
         Paper, section 4.3 and 4.4.
@@ -89,7 +91,10 @@ def match_quotient(
     k = basis_size([x.basis, y.basis], parameters.k if k is None else k)
     source = symmetrized_basis(x.basis.truncate(k), group_x)
     target = symmetrized_basis(y.basis.truncate(k), group_y)
-    described = pair_descriptors(x, y, parameters, k).coefficients
+    if values is None:
+        described = pair_descriptors(x, y, parameters, k).coefficients
+    else:
+        described = source.full.coefficients(values[0]), target.full.coefficients(values[1])
     columns_x, columns_y = (s.even_coeffs.T @ c[:k] for s, c in zip((source, target), described, strict=True))
     more = None
     if parameters.local_weight > 0:

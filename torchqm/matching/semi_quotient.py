@@ -55,6 +55,7 @@ def match_semi_quotient(
     y: PreparedShape,
     group_y: SymmetryGroup,
     parameters: MatchParameters,
+    values: tuple[Float[Tensor, "Vx C"], Float[Tensor, "Vy C"]] | None = None,
 ) -> SemiQuotientMatch:
     """Match a shape without known symmetry to one whose symmetry group is given.
 
@@ -65,6 +66,7 @@ def match_semi_quotient(
         y: target.
         group_y: symmetry group of the target.
         parameters: ``k``, descriptors, ``icp_steps``, ``semi_width``, ``time`` are used.
+        values: descriptors of both in the place of wave or heat kernel signatures.
 
     References:
         Paper, section 5 and Lemma 5.1.
@@ -72,7 +74,10 @@ def match_semi_quotient(
     k = basis_size([x.basis, y.basis], parameters.k)
     basis_x = x.basis.truncate(k)
     target = symmetrized_basis(y.basis.truncate(k), group_y)
-    columns_x, columns_y = (c[:k] for c in pair_descriptors(x, y, parameters).coefficients)
+    if values is None:
+        columns_x, columns_y = (c[:k] for c in pair_descriptors(x, y, parameters).coefficients)
+    else:
+        columns_x, columns_y = basis_x.coefficients(values[0]), target.full.coefficients(values[1])
     columns = columns_x, target.even_coeffs.T @ columns_y
     fmap = fmap_from_coefficients(columns, basis_x.evals, target.even.evals, parameters.commutativity)
     samples = x.samples[: parameters.n_samples]

@@ -5,13 +5,14 @@ References:
     section 5 (semi-quotient), section 6 (symmetries from a reference), section 7.4 (parameters).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.matching.baselines.base import NOTHING, BaselineResult, Given, make_result
 from torchqm.matching.known import KnownSymmetry, given_symmetry
+from torchqm.matching.outside import Descriptors
 from torchqm.matching.parameters import MatchError, MatchParameters
 from torchqm.matching.pipeline import METHODS, Collection
 from torchqm.matching.prepared import match_prepared
@@ -37,6 +38,7 @@ class Ours:
             ``Given.reference``. ``true``: the tables of :class:`Given`. ``known``: the reference if one is given, else
             ``auto``.
         parameters: by default those of the method.
+        descriptors: see :func:`torchqm.matching.match`.
         name: in tables.
         needs: see :class:`torchqm.matching.baselines.Matcher`.
 
@@ -56,6 +58,7 @@ class Ours:
     parameters: MatchParameters | None = None
     name: str = "quotient"
     needs: tuple[str, ...] = ()
+    descriptors: Descriptors | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         for name, value, allowed in (("method", self.method, METHODS), ("axis", self.axis, AXES)):
@@ -77,12 +80,16 @@ class Ours:
             MatchError: a symmetry or the reference is missing, or does not fit.
         """
         given.check(x, y)
-        collection = Collection(None, self.method, self.parameters) if collection is None else collection
+        collection = (
+            Collection(None, self.method, self.parameters, descriptors=self.descriptors)
+            if collection is None
+            else collection
+        )
         if self.axis == "true":
             result, origin = self._true(x, y, given, collection), "the symmetries are given"
         elif self._refers(given.reference):
             known_x, known_y = (self.symmetry(shape, given.reference, collection) for shape in (x, y))
-            result = match_prepared(x, y, known_x, known_y, self.method, collection.parameters, collection.steps)
+            result = self._matched(x, y, known_x, known_y, collection)
             origin = "the symmetries come from the reference"
         else:
             result, origin = collection.match(x, y), "the symmetries come from the two shapes"
@@ -122,7 +129,14 @@ class Ours:
                 _known(x, given.symmetry_x, given.side_x),
                 _known(y, given.symmetry_y, given.side_y),
             )
-        return match_prepared(x, y, known_x, known_y, self.method, collection.parameters, collection.steps)
+        return self._matched(x, y, known_x, known_y, collection)
+
+    def _matched(
+        self, x: PreparedShape, y: PreparedShape, known_x: KnownSymmetry, known_y: KnownSymmetry, collection: Collection
+    ) -> MatchResult:
+        return match_prepared(
+            x, y, known_x, known_y, self.method, collection.parameters, collection.steps, self.descriptors
+        )
 
 
 def _known(shape: PreparedShape, table: Int[Tensor, "G V"], side: Float[Tensor, " V"] | None) -> KnownSymmetry:
