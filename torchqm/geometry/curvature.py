@@ -2,7 +2,7 @@
 
 import torch
 from jaxtyping import Float
-from scipy.sparse import csr_array
+import scipy
 from torch import Tensor
 
 from torchqm.geometry.laplacian import cotan_stiffness, to_scipy
@@ -19,7 +19,7 @@ def vertex_normals(mesh: Mesh) -> Float[Tensor, "V 3"]:
     return torch.nn.functional.normalize(sums, dim=1, eps=1e-300)
 
 
-def mean_curvature(mesh: Mesh, stiffness: csr_array | None = None) -> Float[Tensor, " V"]:
+def mean_curvature(mesh: Mesh, stiffness: "scipy.sparse.csr_array | None" = None) -> Float[Tensor, " V"]:
     """``H = n . (Delta x) / 2`` with the cotangent Laplacian (positive semidefinite); unit 1 / length.
 
     Positive where the surface is convex, if its normals point outward; a sphere of radius r has 1 / r. At single
