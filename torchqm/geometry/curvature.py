@@ -1,8 +1,8 @@
 """Mean curvature at the vertices of a mesh."""
 
+import scipy
 import torch
 from jaxtyping import Float
-import scipy
 from torch import Tensor
 
 from torchqm.geometry.laplacian import cotan_stiffness, to_scipy
