@@ -15,7 +15,7 @@ from time import perf_counter
 
 import numpy as np
 import torch
-from common import DOCS, RESULTS, cached_basis, write_json
+from common import DOCS, RESULTS, write_json
 from torch import Tensor
 from tqdm import tqdm
 
@@ -103,8 +103,8 @@ class Shapes:
     def shape(self, name: str) -> PreparedShape:
         if name not in self._shapes:
             mesh = load_mesh(self.benchmark.mesh_path(name))
-            basis = cached_basis(mesh.normalized(), self.k, self.cache)
-            self._shapes[name] = prepare(mesh, self.k, basis=basis)
+            folder = None if self.cache is None else self.cache / "spectral"  # where torchqm prepare may have put them
+            self._shapes[name] = prepare(mesh, self.k, cache_dir=folder)
         return self._shapes[name]
 
     def distances(self, name: str) -> TruthDistances:
