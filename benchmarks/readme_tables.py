@@ -218,6 +218,97 @@ def speed(data: dict[str, Any]) -> str:
     )
 
 
+def eigenpairs(data: dict[str, Any]) -> str:
+    """Seconds, ratios and accuracy of the eigensolvers."""
+    names = ["torchqm", "scipy eigsh (pyFM's call)", "eigsh with cholespy"]
+    lines = [
+        f"Eigenpairs, `{data['command']}`, {data['threads']} threads, {data['machine']['cpus']} cores ({data['machine']['processor']}): median seconds, in brackets how many",
+        "times as fast as `eigsh(W, k, M, sigma=-0.01)` in the same run; largest relative residual of torchqm's pairs; peak memory.",
+        "",
+        _row(["mesh", "vertices", "k", "runs", *names, "residual", "MiB, torchqm", "MiB, eigsh"]),
+        _row(["---"] * (7 + len(names))),
+    ]
+    for case in data["cases"]:
+        rows = case["solvers"]
+        cells = [f"{rows[n]['seconds']:.2f} ({rows[n]['ratio']:.1f})" for n in names]
+        peaks = [f"{rows[n]['peak_mib']:.0f}" for n in names[:2]]
+        head = [case["mesh"], f"{case['n_verts']:,}", str(case["k"]), str(case["repeats"])]
+        lines.append(_row([*head, *cells, f"{rows['torchqm']['residual_max']:.0e}", *peaks]))
+    found = [
+        case["solvers"]["lobpcg with cholespy"] for case in data["cases"] if "lobpcg with cholespy" in case["solvers"]
+    ]
+    if found:
+        lines += [
+            "",
+            f"LOBPCG, preconditioned with the same factor, took {found[0]['seconds']:.0f} s at 28k and 200, to a residual of {found[0]['residual_max']:.0e}.",
+        ]
+    return "\n".join(lines)
+
+
+def whole_pair(data: dict[str, Any]) -> str:
+    """From mesh files to maps."""
+    a, b = data["pair"]
+    lines = [
+        f"A whole pair, `{data['command']}`, {data['threads']} threads: {a} -> {b}, {data['vertices'][0]:,} and {data['vertices'][1]:,} vertices, from mesh files to the",
+        f"dense maps (torchqm: both, pyFM: one); median seconds, mean plain error at {data['points']} points, peak memory.",
+        "",
+        _row(["method", "runs", "seconds", "times torchqm's", "plain error", "GiB"]),
+        _row(["---"] * 6),
+    ]
+    for name, row in data["methods"].items():
+        cells = [
+            f"{row['seconds']:.1f}",
+            f"{row['times_torchqm']:.1f}",
+            f"{row['plain']:.4f}",
+            f"{row['peak_mib'] / 1024:.1f}",
+        ]
+        lines.append(_row([name, str(len(row["all_seconds"])), *cells]))
+    return "\n".join(lines)
+
+
+def growth(data: dict[str, Any]) -> str:
+    """Largest sizes and exponents."""
+    last = {part: [row for row in rows if "seconds" in row][-1] for part, rows in data["rows"].items()}
+    each = [
+        f"{words} of {last[part]['n_verts']:,} vertices {last[part]['seconds']:.0f} s and {last[part]['peak_mib'] / 1024:.1f} GiB, growing as n^{data['exponents'][part + '_seconds']:.2f} and n^{data['exponents'][part + '_peak_mib']:.2f}"
+        for part, words in (("basis", f"{data['k']} eigenpairs"), ("match", "both maps of a pair"))
+    ]
+    return (
+        f"Growth, `{data['command']}`, {data['threads']} threads, a quadruped subdivided again and again: {'; '.join(each)} (fitted from 4,000 vertices on).\n\n"
+        "![Seconds and memory against the number of vertices](docs/speed_growth.png)"
+    )
+
+
+def learning(data: dict[str, Any]) -> str:
+    """Learned and wave kernel descriptors in three set-ups and in the classical matcher."""
+    lines = [
+        f"Learned descriptors, `{data['command'].split(' --out')[0]}`: trained on built-in creatures as `configs/experiment/quick.yaml` says, tested on {data['n_pairs']} pairs of unseen",
+        f"bodies and triangulations; mean geodesic error / sqrt(area) at {data['points']} points, over the seeds in the third column (WKS has nothing to train).",
+        "The classical rows are `torchqm.match` with true symmetries.",
+        "",
+        _row(["set-up", "features", "seeds", "direct error", "orbit error", "flipped maps", "flipped points"]),
+        _row(["---"] * 7),
+    ]
+    for row in data["table"]:
+        cells = [
+            f"{row[key]:.4f}" + (f" +- {row[key + '_std']:.4f}" if row.get(key + "_std") else "")
+            for key in ("direct", "orbit")
+        ]
+        lines.append(
+            _row(
+                [
+                    row["setup"],
+                    row["features"],
+                    str(row["runs"]),
+                    *cells,
+                    f"{row['flipped_maps']:.2f}",
+                    f"{row['flipped_points']:.3f}",
+                ]
+            )
+        )
+    return "\n".join(lines)
+
+
 def layers(data: dict[str, Any]) -> str:
     """Time and memory of the layers."""
     solver, blocks, basis, soft = (data[part] for part in ("solver", "blocks", "basis", "soft_map"))
@@ -313,8 +404,16 @@ def main() -> int:
             f"Evaluation, `{speed_of['command']}`: {speed_of['shapes']} shapes ({speed_of['vertices']:,} vertices in all) read with their "
             f"eigenfunctions from the cache and a map to each measured, {speed_of['seconds']:.0f} s with {speed_of['jobs']} processes."
         )
-    if (RESULTS / "layers.json").exists():
-        parts.append(layers(json.loads((RESULTS / "layers.json").read_text())))
+    single = {
+        "layers": layers,
+        "speed_eigenpairs": eigenpairs,
+        "speed_match": whole_pair,
+        "speed_growth": growth,
+        "learning": learning,
+    }
+    for name, make in single.items():
+        if (RESULTS / f"{name}.json").exists():
+            parts.append(make(json.loads((RESULTS / f"{name}.json").read_text())))
     if (RESULTS / "comparison").exists():
         parts.insert(0, comparison(RESULTS / "comparison"))
     readme = ROOT / "README.md"
