@@ -58,7 +58,12 @@ def symmetries(shapes: Shapes, names: list[str], collection: Collection) -> dict
 
 
 def matches(
-    shapes: Shapes, pairs: list[tuple[str, str]], collection: Collection, n_paper: int, root: Path
+    shapes: Shapes,
+    pairs: list[tuple[str, str]],
+    collection: Collection,
+    n_paper: int,
+    root: Path,
+    reflected: Truth | None,
 ) -> dict[str, dict[str, Any]]:
     rows = {}
     for number, (a, b) in enumerate(tqdm(pairs, desc="pairs")):
@@ -74,8 +79,8 @@ def matches(
             row["direct"] = row["label"] == "direct" and row["plain"] <= row["as_mirrored"]
         row |= {key: value for key, value in result.details.items() if key.startswith("residual")}
         row["bim_plain"] = bim(root, [(a, b)])[0][0].mean
-        if number < n_paper and isinstance(shapes.truth, Truth):
-            row["seconds_paper"] = paper_seconds(shapes, shapes.truth, a, b)
+        if number < n_paper and reflected is not None:
+            row["seconds_paper"] = paper_seconds(shapes, reflected, a, b)
         row["warnings"] = result.warnings
         rows[f"{a} -> {b}"] = row
     return rows
@@ -126,7 +131,7 @@ def main() -> None:
         group = Shapes(benchmark, truth, args.cache, args.functions)
         collection = Collection(parameters=OURS)  # remembers what it found of each shape
         shapes = symmetries(group, benchmark.shapes(name), collection)
-        pairs = matches(group, benchmark.published_pairs(name), collection, args.paper, args.scb)
+        pairs = matches(group, benchmark.published_pairs(name), collection, args.paper, args.scb, reflected)
         classes[name] = {**summary(shapes, pairs), "each_shape": shapes, "each_pair": pairs}
         every_shape, every_pair = every_shape | shapes, every_pair | pairs
         print(name, {k: v for k, v in classes[name].items() if not k.startswith("each")}, flush=True)

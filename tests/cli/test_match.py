@@ -62,7 +62,7 @@ def test_prepared_eigenpairs_are_used_and_change_nothing(pair, tmp_path, monkeyp
     assert main(argv) == 0
     entries = {path.name: path.stat().st_mtime_ns for path in cache.glob("*.npz")}
     assert len(entries) == 3
-    monkeypatch.setattr("torchqm.spectral.cache.eigenbasis", None)  # nothing can be computed
+    monkeypatch.setattr("torchqm.spectral.cache.eigenbasis_and_note", None)  # nothing can be computed
     assert run(pair, tmp_path, "--cache", cache) == 0
     assert {path.name: path.stat().st_mtime_ns for path in cache.glob("*.npz")} == entries
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())

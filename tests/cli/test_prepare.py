@@ -35,13 +35,13 @@ def root(tmp_path, monkeypatch):
 @pytest.fixture
 def solved(monkeypatch):
     """Labels of the shapes whose eigenpairs were computed."""
-    labels, plain = [], cache.eigenbasis
+    labels, plain = [], cache.eigenbasis_and_note
 
     def eigenbasis(operator, k, name):
         labels.append(os.path.basename(name))
         return plain(operator, k, name)
 
-    monkeypatch.setattr(cache, "eigenbasis", eigenbasis)
+    monkeypatch.setattr(cache, "eigenbasis_and_note", eigenbasis)
     return labels
 
 
@@ -88,7 +88,7 @@ import os, signal, sys
 from torchqm.cli.main import main
 from torchqm.spectral import cache
 
-plain, count = cache.eigenbasis, 0
+plain, count = cache.eigenbasis_and_note, 0
 
 def eigenbasis(*arguments):
     global count
@@ -97,7 +97,7 @@ def eigenbasis(*arguments):
         os.kill(os.getpid(), signal.SIGKILL)
     return plain(*arguments)
 
-cache.eigenbasis = eigenbasis
+cache.eigenbasis_and_note = eigenbasis
 main(["prepare", sys.argv[1], "--k", "9", "--jobs", "1"])
 """
     run = subprocess.run([sys.executable, "-c", code, str(root)], capture_output=True, timeout=120)
@@ -115,14 +115,14 @@ main(["prepare", sys.argv[1], "--k", "9", "--jobs", "1"])
 
 
 def test_an_interruption_keeps_what_is_done(root, monkeypatch, capsys):
-    plain = cache.eigenbasis
+    plain = cache.eigenbasis_and_note
 
     def eigenbasis(operator, k, name):
         if name.endswith("a3.off"):
             raise KeyboardInterrupt
         return plain(operator, k, name)
 
-    monkeypatch.setattr(cache, "eigenbasis", eigenbasis)
+    monkeypatch.setattr(cache, "eigenbasis_and_note", eigenbasis)
     assert prepare(root, "--k", 9) == 130
     assert "interrupted; 2 of 4 shapes are in" in capsys.readouterr().err
     assert len(kept(root / FOLDER)) == 2

@@ -69,7 +69,7 @@ def test_given_eigenpairs_are_used(mesh):
 
 def test_eigenpairs_from_the_cache_are_those_that_are_computed(mesh, shape, tmp_path, monkeypatch):
     first = prepare(mesh, 20, cache_dir=tmp_path)
-    monkeypatch.setattr("torchqm.spectral.cache.eigenbasis", None)  # from here on nothing can be computed
+    monkeypatch.setattr("torchqm.spectral.cache.eigenbasis_and_note", None)  # from here on nothing can be computed
     again, fewer = prepare(mesh, 20, cache_dir=tmp_path), prepare(mesh, 9, cache_dir=tmp_path)
     monkeypatch.setenv("TORCHQM_CACHE", str(tmp_path))
     for found in (first, again, prepare(mesh, 20)):

@@ -29,7 +29,7 @@ def share(patch: pytest.MonkeyPatch, folder: Path) -> None:
     for name in ("_body", "_retriangulated"):
         patch.setattr(synthetic, name, _in_files(getattr(synthetic, name).__wrapped__, folder))
     patch.setattr(known, "find_reflections", _kept(known.find_reflections, _mesh))
-    patch.setattr(shape, "eigenbasis", _kept(shape.eigenbasis, _operator))
+    patch.setattr(shape, "eigenbasis_and_note", _kept(shape.eigenbasis_and_note, _operator))
 
 
 def _in_files(plain: Callable[..., Any], folder: Path) -> Callable[..., Any]:

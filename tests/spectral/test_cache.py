@@ -341,7 +341,7 @@ from torchqm.spectral import cache, cache_file
 
 torch.set_num_threads(1)
 folder = Path(sys.argv[1])
-mesh, plain = blob(1, 2).mesh, cache.eigenbasis
+mesh, plain = blob(1, 2).mesh, cache.eigenbasis_and_note
 truth = cache.cached_basis(mesh, 8)
 
 def logged(*arguments):
@@ -351,7 +351,7 @@ def logged(*arguments):
     return plain(*arguments)
 
 def once(number):
-    cache.eigenbasis = logged
+    cache.eigenbasis_and_note = logged
     basis = cache.cached_basis(mesh, 8, cache_dir=folder / "once")
     return torch.equal(basis.evecs, truth.evecs) and not basis.report.problems
 

@@ -6,8 +6,10 @@ import scipy.sparse as sp
 import torch
 from references.shapes import icosphere
 
+import torchqm.spectral.lanczos as module
 from torchqm.data.synthetic import creature
 from torchqm.geometry import Mesh, laplacian, to_scipy
+from torchqm.spectral import eigenbasis, relative_residuals
 from torchqm.spectral.lanczos import LanczosError, lowest_eigenpairs
 
 
@@ -38,7 +40,10 @@ def torus_spectrum(n: int, k: int) -> np.ndarray:
     return np.sort((ring[:, None, None] + ring[:, None] + ring).ravel())[:k]
 
 
-@pytest.mark.parametrize(("factor", "k"), [(1.0, 40), (0.2, 40), (8.0, 40), (1.0, 7), (1.0, 150)])
+@pytest.mark.parametrize(
+    ("factor", "k"),
+    [(1.0, 40), (0.2, 40), (0.01, 40), (8.0, 40), (100.0, 40), (1.0, 1), (1.0, 2), (1.0, 7), (1.0, 150)],
+)
 def test_agrees_with_the_dense_solver_whatever_the_guess(mirror_blob, factor, k):
     matrix = scaled(mirror_blob.mesh)
     evals, evecs = np.linalg.eigh(matrix.toarray())
@@ -49,7 +54,7 @@ def test_agrees_with_the_dense_solver_whatever_the_guess(mirror_blob, factor, k)
     np.testing.assert_allclose(np.abs(np.linalg.det(overlap)), 1, atol=1e-7)  # the same space
     np.testing.assert_allclose((pairs.evecs @ pairs.evecs.T).numpy(), np.eye(k), atol=1e-10)
     assert pairs.residuals.max() < 1e-10 + 1e-12 * evals[-1] / evals[1]
-    assert (pairs.attempts > 1) == (factor == 0.2)  # the filter began below the last eigenvalue wanted
+    assert (pairs.attempts > 1) == (factor < 1)  # the filter began below the last eigenvalue wanted
 
 
 def test_residuals_are_those_of_the_matrix(mirror_blob):
@@ -88,15 +93,62 @@ def test_every_component_has_its_constant():
     np.testing.assert_allclose(pairs.evals, 6 * np.repeat(single, 6)[:40], atol=1e-6 * pairs.evals[-1])
 
 
+def test_residuals_of_what_comes_out_are_checked(monkeypatch, mirror_blob):
+    """Bounds that are too small by far: what comes out does not keep them, and is not handed out."""
+    monkeypatch.setattr(module._Run, "_bounds", lambda self, rest: np.full(self.k, 1e-30))
+    with pytest.raises(LanczosError, match=r"pair \d+ of 40 has a residual of \S+, not 1e-08"):
+        lowest_eigenpairs(scaled(mirror_blob.mesh), 40, 1e-8, 4 * np.pi * 40)
+
+
+@pytest.mark.parametrize("count", [20, 70])
+def test_more_components_than_a_block_has_vectors(count):
+    mesh = copies(icosphere(2), count)
+    basis = eigenbasis(laplacian(mesh), count + 10, solver="lanczos")
+    area = float(basis.mass.sum())
+    assert basis.evals[:count].max() * area < 1e-6
+    single = np.linalg.eigvalsh(scaled(icosphere(2)).toarray())[1]
+    np.testing.assert_allclose(basis.evals[count:].numpy() * area, count * single, rtol=1e-9)
+    assert relative_residuals(laplacian(mesh), basis).max() < 1e-7
+
+
+@pytest.mark.parametrize("tol", [1e-3, 1e-6])
+def test_a_loose_tolerance_makes_no_clusters_of_ordinary_eigenvalues(tol):
+    matrix = scaled(creature("biped", 2000).mesh)
+    pairs = lowest_eigenpairs(matrix, 300, tol, 4 * np.pi * 300)
+    exact = np.linalg.eigvalsh(matrix.toarray())[:300]
+    assert pairs.attempts == 1
+    assert pairs.residuals.max() <= tol
+    np.testing.assert_allclose(pairs.evals[1:], exact[1:], rtol=10 * tol**2 + 1e-11)
+
+
 def test_equal_input_equal_output(mirror_blob):
     matrix = scaled(mirror_blob.mesh)
     first, again = (lowest_eigenpairs(matrix, 20, 1e-8, 250.0) for _ in range(2))
     assert torch.equal(first.evecs, again.evecs)
 
 
-def test_more_copies_than_four_blocks_have_is_an_error():
-    with pytest.raises(LanczosError, match=r"\d+ equal eigenvalues in blocks of (16|32|64)"):
-        lowest_eigenpairs(sp.csc_array(sp.diags_array(np.repeat(np.arange(1.0, 11), 100))), 100, 1e-8, 2.0)
+def test_more_copies_than_the_widest_blocks_have_is_an_error():
+    """All in one component: nothing says beforehand that there are so many."""
+    chain = 2.5 * np.eye(100) - np.eye(100, k=1) - np.eye(100, k=-1)
+    matrix = sp.csc_array(np.kron(np.eye(10), chain) + 1e-12)
+    with pytest.raises(LanczosError, match=r"equal eigenvalues in blocks of"):
+        lowest_eigenpairs(matrix, 100, 1e-8, 1.0, block=2)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [({"k": 0}, "k: 0 given"), ({"guess": float("nan")}, "guess: nan given"), ({"tol": -1.0}, "tol: -1.0 given")],
+)
+def test_wrong_arguments(mirror_blob, change, text):
+    with pytest.raises(ValueError, match=text):
+        lowest_eigenpairs(**{"matrix": scaled(mirror_blob.mesh), "k": 5, "tol": 1e-8, "guess": 60.0, **change})
+
+
+def test_entries_that_are_not_finite(mirror_blob):
+    matrix = scaled(mirror_blob.mesh)
+    matrix.data[7] = np.nan
+    with pytest.raises(ValueError, match="matrix: has entries that are NaN"):
+        lowest_eigenpairs(matrix, 5, 1e-8, 60.0)
 
 
 def test_no_convergence_says_how_far_it_came(mirror_blob):

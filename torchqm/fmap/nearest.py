@@ -38,10 +38,9 @@ def nearest_rows(queries: Float[Tensor, "Q D"], points: Float[Tensor, "P D"]) ->
         raise ValueError("points: there are none to choose from")
     if not bool(torch.isfinite(queries.sum() + points.sum())):  # NaN and infinities survive a sum
         raise ValueError("queries and points must be finite; a spectral coordinate is NaN or infinite")
-    # Distances are differences of products: what all points share would cost the digits that tell them apart.
-    centre = points.mean(0)
-    queries, points = queries - centre, points - centre
     if queries.shape[0] * points.shape[0] <= _SMALL:
+        centre = points.mean(0)  # see _blocked
+        queries, points = queries - centre, points - centre
         # || q - p ||^2 without || q ||^2, which is the same for all points
         return torch.argmax(queries @ points.T - points.square().sum(1) / 2, dim=1)
     return torch.from_numpy(_blocked(queries.detach().numpy(), points.detach().numpy()))
@@ -63,7 +62,7 @@ def _blocked(
         np.subtract(part.T, centre[:, None], out=block[:d], casting="same_kind")
         block[d] = np.einsum("dp,dp->p", block[:d], block[:d]) / -2
         # One range of queries a worker; each range is put together from blocks that stay in the cache.
-        chunk = max(rows, -(-n // workers()))
+        chunk = rows * max(1, -(-n // (rows * workers())))  # the same products whatever the number of workers
         in_parallel(
             [
                 partial(_improve, longer[i : i + chunk], block, start, rows, best[i : i + chunk], found[i : i + chunk])

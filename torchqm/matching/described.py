@@ -63,7 +63,7 @@ class PairDescriptors:
 
 _Key = tuple[object, ...]
 _KEPT: WeakKeyDictionary[PreparedShape, WeakKeyDictionary[PreparedShape, dict[_Key, PairDescriptors]]]
-_KEPT = WeakKeyDictionary()  # a few thousand numbers a pair, as long as both shapes are there
+_KEPT = WeakKeyDictionary()  # of the last pair alone: 240 KB at 30 functions, and a collection may have many pairs
 
 
 def pair_descriptors(x: PreparedShape, y: PreparedShape, parameters: MatchParameters, k: int = 0) -> PairDescriptors:
@@ -86,6 +86,8 @@ def pair_descriptors(x: PreparedShape, y: PreparedShape, parameters: MatchParame
         if found is not None:
             return found if first is x else found.swapped()
     found = _computed(x, y, parameters, n_functions, k)
+    if y not in _KEPT.get(x, {}):
+        _KEPT.clear()
     _KEPT.setdefault(x, WeakKeyDictionary()).setdefault(y, {})[key] = found
     return found
 

@@ -17,7 +17,7 @@ from torchqm.geometry.mesh import Mesh
 from torchqm.geometry.sampling import area_samples
 from torchqm.spectral.basis import SpectralBasis
 from torchqm.spectral.cache import cache_folder, cached_basis
-from torchqm.spectral.eigen import eigenbasis
+from torchqm.spectral.eigen import eigenbasis_and_note
 from torchqm.spectral.features import smooth_curvature
 
 __all__ = ["N_ANCHORS", "PreparedShape", "complete", "prepare"]
@@ -133,7 +133,11 @@ def prepare(
         operator = f"{kept.report.kind}: {kept.report.reason}; eigenpairs: {origin}"
     else:
         chosen = laplacian(mesh.normalized(), kind, report)
-        basis = eigenbasis(chosen, k, mesh.label) if basis is None else basis.truncate(k)
+        if basis is None:
+            basis, note = eigenbasis_and_note(chosen, k, mesh.label)
+            problems = (note,) if note else ()
+        else:
+            basis = basis.truncate(k)
         operator = f"{chosen.kind}: {chosen.reason}"
     samples = area_samples(unit, min(n_samples, int((unit.vertex_areas > 0).sum())), seed)
     warnings = [*report.warnings, *(f"{mesh.label}: {text}" for text in warnings), *problems]

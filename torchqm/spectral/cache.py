@@ -16,7 +16,7 @@ from torchqm.geometry.mesh import Mesh
 from torchqm.spectral.basis import SpectralBasis, cluster_end
 from torchqm.spectral.cache_file import KINDS, Entry, content_hash, entry_files, entry_path, read_entry, write_entry
 from torchqm.spectral.diffusion_net import DiffusionNetError, diffusion_net_files, read_diffusion_net
-from torchqm.spectral.eigen import eigenbasis
+from torchqm.spectral.eigen import SpectrumWarning, eigenbasis_and_note
 from torchqm.version import __version__
 
 __all__ = [
@@ -215,9 +215,12 @@ def _compute(mesh: Mesh, k: int, kind: str) -> Entry:
     """Eigenpairs, and one eigenvalue more."""
     operator = laplacian(mesh, kind)
     more = 1 if 1 <= k < int((operator.mass > 0).sum()) else 0
-    basis = eigenbasis(operator, k + more, mesh.label)
+    basis, note = eigenbasis_and_note(operator, k + more, mesh.label)
+    if note:
+        warnings.warn(note, SpectrumWarning, stacklevel=4)
     next_eval = float(basis.evals[k]) if more else np.inf
-    return Entry(basis.truncate(k), next_eval, operator.kind, operator.reason, f"torchqm {__version__}")
+    reason = f"{operator.reason}; {note}" if note else operator.reason
+    return Entry(basis.truncate(k), next_eval, operator.kind, reason, f"torchqm {__version__}")
 
 
 def _make(folder: Path, mesh: Mesh, k: int, kind: str, looked: _Looked) -> tuple[Entry, str]:

@@ -9,7 +9,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-__all__ = ["BLOCK", "LanczosError", "LanczosPairs", "lowest_eigenpairs"]
+__all__ = ["BLOCK", "LanczosError", "LanczosPairs", "lowest_eigenpairs", "residual_scale"]
 
 BLOCK = 16
 """Vectors of a block.
@@ -23,9 +23,8 @@ _SHIFT, _CUT = (
 )  # of the last eigenvalue wanted: below zero, and where the filter begins to let functions through
 _COLUMNS = 8  # right-hand sides of one call: 0.5 ms each at 28k vertices, with 200 in one call 0.9 ms
 _CHECK_FROM, _CHECK_EVERY = 1.2, 2
-_MARGIN = 1.05
+_GUESSES, _WIDER = 4, 2  # filters that are tried, and how often the blocks are doubled
 _ZERO = 1e-9  # of the last eigenvalue wanted: the eigenvalue of a constant function is below it
-_ATTEMPTS = 3
 
 Operation = Callable[[Tensor], Tensor]
 
@@ -41,7 +40,8 @@ class LanczosPairs:
     Args:
         evals: ``(k,)`` ascending.
         evecs: ``(k, n)`` orthonormal rows.
-        residuals: ``(k,)`` ``|| A x - lambda x || / lambda``; for eigenvalues of zero over the first that is not.
+        residuals: ``(k,)`` ``|| A x - lambda x || / scale``.
+        scale: ``(k,)`` the eigenvalues; for those of zero the first that is not.
         size: vectors of the subspace in the end.
         attempts: how often the filter had to be chosen anew, and 1.
     """
@@ -49,6 +49,7 @@ class LanczosPairs:
     evals: np.ndarray
     evecs: Tensor
     residuals: np.ndarray
+    scale: np.ndarray
     size: int
     attempts: int
 
@@ -74,30 +75,80 @@ def lowest_eigenpairs(
             more, the block is doubled.
 
     Raises:
-        LanczosError: no factorisation, no convergence, or clusters of equal eigenvalues wider than four blocks.
+        LanczosError: no factorisation, no convergence, too few rows, or more equal eigenvalues than a block can hold
+            that was made four times as wide.
+        ValueError: ``k``, ``tol``, ``guess`` or ``block`` that make no sense, or entries that are not finite.
 
     References:
         G. Golub, R. Underwood, "The block Lanczos method for computing eigenvalues", 1977; filters in the manner of
         Y. Zhou et al., "Self-consistent-field calculations using Chebyshev-filtered subspace iteration", 2006.
     """
-    seen = ""
-    for attempt in range(1, _ATTEMPTS + 1):
-        with threadpool_limits(1, "blas"):  # of NumPy's small matrices; the long products are torch's
-            run = _Run(matrix, k, tol, guess, block)
-            converged = run.iterate()
-            found = run.last_wanted()
-            if converged and found is not None:
-                pairs = run.pairs(attempt)
-                widest = _widest_cluster(pairs.evals, 10 * tol, guess)
-                if widest < block:
-                    return pairs
-                seen, block = f"{widest} equal eigenvalues in blocks of {block}", 2 * block
-                if block > 4 * BLOCK:
-                    break
-                continue
-        seen = f"{run.done} of {k} pairs within {tol:g} from {run.size} vectors, filter at {guess:.4g}"
-        guess = 2 * guess if found is None else found
-    raise LanczosError(f"block Lanczos: {seen}")
+    for name, value in (("k", k), ("tol", tol), ("guess", guess), ("block", block)):
+        if not 0 < value < float("inf"):
+            raise ValueError(f"{name}: {value} given, expected a positive number")
+    if not np.isfinite(matrix.data).all():
+        raise ValueError("matrix: has entries that are NaN or infinite")
+    # Zero comes as often as there are components.
+    components = int(scipy.sparse.csgraph.connected_components(matrix, directed=False)[0])
+    block *= -(-(components + 1) // block)
+    inner, guesses, wider, attempts = tol / 4, _GUESSES, _WIDER, 0
+    while True:
+        attempts += 1
+        seen = _attempt(matrix, k, inner, guess, block, attempts)
+        if seen.pairs is None:
+            text = f"{seen.done} of {k} pairs within {tol:g} from {seen.size} vectors, filter at {guess:.4g}"
+            guess, guesses = seen.guess, guesses - 1
+        elif (widest := _widest_cluster(seen.pairs.evals, min(10 * tol, 1e-6), guess)) >= block:
+            text = f"{widest} equal eigenvalues in blocks of {block}"
+            block, wider = 2 * block, wider - 1
+        elif (text := _excess(matrix, seen.pairs, tol)) == "":
+            return seen.pairs
+        else:  # a cluster of pairs that were all just within the bound
+            inner, guesses = inner / 10, guesses - 1
+        if guesses == 0 or wider < 0:
+            raise LanczosError(f"block Lanczos: {text}")
+
+
+def residual_scale(evals: np.ndarray, otherwise: float) -> np.ndarray:
+    """What residuals are relative to: the eigenvalue; for those of constants the first other one, if there is one.
+
+    Example:
+        >>> residual_scale(np.array([0.0, 2.0, 8.0]), 1.0)
+        array([2., 2., 8.])
+    """
+    above = evals[evals > _ZERO * max(evals[-1], otherwise)]
+    return np.maximum(evals, above[0] if above.size else otherwise)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What one filter and one width of blocks gave: the pairs, or a better guess."""
+
+    pairs: LanczosPairs | None
+    guess: float
+    done: int
+    size: int
+
+
+def _attempt(matrix: "scipy.sparse.csc_array", k: int, tol: float, guess: float, block: int, number: int) -> _Seen:
+    """One run; nothing of it stays in memory but what is returned."""
+    with threadpool_limits(1, "blas"):  # of NumPy's small matrices; the long products are torch's
+        run = _Run(matrix, k, tol, guess, block)
+        try:
+            pairs = run.pairs(number) if run.iterate() else None
+        except np.linalg.LinAlgError as error:
+            raise LanczosError(f"block Lanczos: {error}") from error
+    return _Seen(pairs, run.better_guess(), run.done, run.size)
+
+
+def _excess(matrix: "scipy.sparse.csc_array", pairs: LanczosPairs, tol: float) -> str:
+    """Which residual is larger than it may be, in words; nothing if none is."""
+    # The product A x alone is wrong by eps |A|; the lowest eigenvalues feel it most.
+    rounding = 10 * np.finfo(np.float64).eps * abs(matrix).sum(0).max() / pairs.scale
+    worst = int(np.argmax(pairs.residuals / np.maximum(tol, rounding)))
+    if pairs.residuals[worst] <= max(tol, float(rounding[worst])):
+        return ""
+    return f"pair {worst} of {len(pairs.residuals)} has a residual of {pairs.residuals[worst]:.2g}, not {tol:g}"
 
 
 class _Run:
@@ -110,6 +161,8 @@ class _Run:
         self.solve = _solver(matrix, self.shift)
         self.centre = 0.5 / (_CUT * guess + self.shift)
         self.limit = min(4 * k + 30 * block, n - block)
+        if self.limit < k + block:
+            raise LanczosError(f"block Lanczos: {n} rows are too few for {k} pairs in blocks of {block}")
         self.vectors = torch.empty(self.limit, n, dtype=torch.float64)  # memory is taken as it is written
         self.projected = np.zeros((self.limit, self.limit))
         self.random = np.random.default_rng(0)
@@ -131,14 +184,19 @@ class _Run:
             if full or (self.size >= _CHECK_FROM * self.k and steps % _CHECK_EVERY == 0):
                 if self._converged(rest, begin):
                     return True
-                if full:
+                # The filter began below the last eigenvalue wanted: more vectors will not help.
+                if full or (self.size >= 2 * self.k + 4 * self.block and self._open() < self.k):
                     return False
 
-    def last_wanted(self) -> float | None:
-        """The ``k``-th eigenvalue as seen by the filter; None if it lies where the filter lets nothing through."""
-        if self.theta.size < self.k or self.theta[-1] <= _MARGIN * self.centre**2:
-            return None
-        return float(1 / (self.centre + np.sqrt(self.theta[-1])) - self.shift)
+    def better_guess(self) -> float:
+        """The ``k``-th eigenvalue as seen by the filter; a larger one where the filter lets less than ``k`` through."""
+        if self.theta.size == self.k and self.theta[-1] > self.centre**2:
+            return float(1 / (self.centre + np.sqrt(self.theta[-1])) - self.shift)
+        return self.guess * float(np.clip(1.5 * self.k / max(self._open(), 1), 2, 16))
+
+    def _open(self) -> int:
+        """How many of the pairs wanted the filter lets through."""
+        return int((self.theta > self.centre**2).sum())
 
     def pairs(self, attempts: int) -> LanczosPairs:
         """Ritz vectors, one more solve of each, and the matrix diagonalised on what comes out."""
@@ -150,10 +208,8 @@ class _Run:
         evecs = torch.from_numpy(turn.T.copy()) @ solved
         evals = shifted - self.shift
         applied = (self.matrix @ evecs.numpy().T).T - evals[:, None] * evecs.numpy()
-        lowest = evals[evals > _ZERO * self.guess]
-        scale = np.maximum(evals, lowest[0] if lowest.size else self.guess)
-        residuals = np.linalg.norm(applied, axis=1) / scale
-        return LanczosPairs(evals, evecs, residuals, self.size, attempts)
+        scale = residual_scale(evals, self.guess)
+        return LanczosPairs(evals, evecs, np.linalg.norm(applied, axis=1) / scale, scale, self.size, attempts)
 
     def _converged(self, rest: np.ndarray, begin: int) -> bool:
         theta, ritz = np.linalg.eigh(self.projected[: self.size, : self.size])
@@ -171,8 +227,7 @@ class _Run:
         root = np.sqrt(np.maximum(self.theta, 0))
         open_, shifted = root > self.centre, 1 / (self.centre + root)
         evals = shifted - self.shift
-        lowest = evals[evals > _ZERO * self.guess]
-        scale = np.maximum(evals, lowest[0] if lowest.size else self.guess)
+        scale = residual_scale(evals, self.guess)
         gap = np.where(open_, root - self.centre, 1.0)
         bounds = np.linalg.norm(rest, axis=0) * shifted**2 / (gap * scale)
         return np.where(open_, bounds, np.inf)
