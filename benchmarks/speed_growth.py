@@ -1,6 +1,7 @@
 """How seconds and memory of a basis and of a match grow with the number of vertices, on a built-in creature."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -107,6 +108,7 @@ def _status(name: str) -> int:
 
 
 if __name__ == "__main__":
+    os.environ.pop("TORCHQM_CACHE", None)
     torch.set_num_threads(int(sys.argv[3]))
     torch.set_grad_enabled(False)
     print(json.dumps(one(sys.argv[1], int(sys.argv[2]))))

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import statistics
 import tempfile
 from collections.abc import Callable
@@ -63,6 +64,13 @@ def _pyfm(source: Path, target: Path, zoomout: bool) -> np.ndarray:
         return np.asarray(model.get_p2p(FM=fmap if fmap is not None else model.FM))
 
 
+def _pyfm_loaded() -> None:
+    """Its modules, so that no turn pays for them; torchqm's are loaded, too, by then."""
+    import pyFM.functional
+    import pyFM.mesh
+    import pyFM.refine  # noqa: F401
+
+
 def pair_of(scb: Path | None) -> tuple[Mesh, Mesh, torch.Tensor, torch.Tensor]:
     """Source, target, points of the source, and where they belong."""
     if scb is not None:
@@ -75,6 +83,7 @@ def pair_of(scb: Path | None) -> tuple[Mesh, Mesh, torch.Tensor, torch.Tensor]:
 
 def measure(repeats: int, scb: Path | None) -> None:
     """Every method, in turn; the peers less often, since they take minutes."""
+    os.environ.pop("TORCHQM_CACHE", None)
     source, target, at, truth = pair_of(scb)
     seconds: dict[str, list[float]] = {name: [] for name in METHODS}
     errors: dict[str, dict[str, float]] = {}
@@ -85,9 +94,10 @@ def measure(repeats: int, scb: Path | None) -> None:
         for mesh, path in zip((source, target), files, strict=True):
             save_mesh(mesh, path)
         ours_cached(*files, cache)
+        _pyfm_loaded()
         for turn in range(repeats):
             for name, method in METHODS.items():
-                if name.startswith("pyFM") and turn >= 2:
+                if name.startswith("pyFM") and turn >= 3:
                     continue
                 begin = perf_counter()
                 found = torch.from_numpy(np.asarray(method(*files, cache)).astype(np.int64))

@@ -53,6 +53,18 @@ def test_finished_runs_are_skipped_and_the_one_that_was_stopped_begins_anew(tmp_
     assert run_sweep(plan(), tmp_path, progress(said), never) == rows
 
 
+def test_a_config_that_was_changed_is_not_mixed_with_what_it_was(tmp_path):
+    (tmp_path / "model.yaml").write_text("k: 40")
+    (tmp_path / "a.yaml").write_text("model: model.yaml")
+    sweep = Sweep(tmp_path / "a.yaml", (0,))
+    out = tmp_path / "out"
+    run_sweep(sweep, out, progress(io.StringIO()), lambda run: {"test_orbit_error": 0.5})
+    assert run_sweep(sweep, out, progress(io.StringIO()), never)[0]["test_orbit_error"] == 0.5
+    (tmp_path / "model.yaml").write_text("k: 60")  # the file itself is the same
+    with pytest.raises(UserError, match=r"seed=0: has a run of a config that was changed since \(result.json\)"):
+        run_sweep(sweep, out, progress(io.StringIO()), never)
+
+
 def test_a_run_that_fails_is_in_the_table_and_the_others_go_on(tmp_path):
     def train(run):
         if run.name == "k=20-seed=0":

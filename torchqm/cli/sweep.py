@@ -52,7 +52,7 @@ def run_sweep(sweep: Sweep, out: Path, progress: Progress, train: Callable[[Run]
             folder = out / run.name
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
-            _write(folder / _STARTED, {"arguments": list(run.arguments)})
+            _write(folder / _STARTED, {"arguments": list(run.arguments), "config": run.digest})
             progress.listener(run.name, -1.0, number / len(waiting))
             begin = perf_counter()
             try:
@@ -60,7 +60,13 @@ def run_sweep(sweep: Sweep, out: Path, progress: Progress, train: Callable[[Run]
             except UserError as error:  # such as a loss that is not finite: the other runs may do better
                 values, status = {}, f"failed: {' '.join(str(error).split())}"
             seconds = perf_counter() - begin
-            result = {"arguments": list(run.arguments), "status": status, "seconds": seconds, "values": values}
+            result = {
+                "arguments": list(run.arguments),
+                "config": run.digest,
+                "status": status,
+                "seconds": seconds,
+                "values": values,
+            }
             _write(folder / _RESULT, result)
             progress.listener(run.name, seconds, (number + 1) / len(waiting))
         head = {"run": run.name, **run.labels, "seed": run.seed, "status": result["status"]}
@@ -212,6 +218,11 @@ def _kept(folder: Path, run: Run) -> Any:
     for name in (_RESULT, _STARTED):
         if (folder / name).is_file():
             found = json.loads((folder / name).read_text())
+            if found.get("config") != run.digest:
+                raise UserError(
+                    f"{folder}: has a run of a config that was changed since ({name}); its results would be mixed with "
+                    "others: take another folder, or delete this one"
+                )
             if found["arguments"] != list(run.arguments):
                 raise UserError(f"{folder}: has a run with other arguments ({name}); give another --out, or remove it")
             return found if name == _RESULT else None

@@ -10,7 +10,7 @@ from typing import Any
 from torchqm.cli.config_errors import nearest_key
 from torchqm.cli.console import UserError
 
-__all__ = ["Run", "Sweep", "read_sweep", "runs_of", "word"]
+__all__ = ["Run", "Sweep", "config_digest", "read_sweep", "runs_of", "word"]
 
 _KEYS = ("config", "seeds", "options", "setups", "grid")
 
@@ -36,12 +36,38 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Run:
-    """One run: its folder's name, what tells it from the others, and its arguments for ``torchqm fit``."""
+    """One run: its folder's name, what tells it from others, its arguments for ``torchqm fit``, its config's hash."""
 
     name: str
     labels: Mapping[str, Any]
     seed: int
     arguments: Sequence[str]
+    digest: str = ""
+
+
+def config_digest(path: Path) -> str:
+    """A hash of what stands in a YAML file and in the YAML files it names; the same as long as a run means the same."""
+    import hashlib
+
+    import yaml
+
+    found = hashlib.sha256()
+
+    def add(file: Path) -> None:
+        if not file.is_file():
+            return  # LightningCLI says so
+        text = file.read_text(errors="replace")
+        found.update(text.encode())
+        try:
+            values = yaml.safe_load(text)
+        except yaml.YAMLError:
+            return
+        for value in values.values() if isinstance(values, dict) else ():
+            if isinstance(value, str) and value.endswith((".yaml", ".yml")):
+                add(file.parent / value)
+
+    add(path)
+    return found.hexdigest()[:16]
 
 
 def read_sweep(path: Path) -> Sweep:
@@ -79,7 +105,7 @@ def runs_of(sweep: Sweep, out: Path) -> list[Run]:
         >>> [run.name for run in runs_of(plan, Path("out"))]
         ['k=20-seed=0', 'k=40-seed=0', 'k=20-seed=1', 'k=40-seed=1']
     """
-    runs = []
+    runs, digest = [], config_digest(sweep.config)
     setups = sweep.setups or {"": {}}
     for seed, (setup, own), values in itertools.product(
         sweep.seeds, setups.items(), itertools.product(*sweep.grid.values())
@@ -93,7 +119,7 @@ def runs_of(sweep: Sweep, out: Path) -> list[Run]:
         words = [part for key, value in options.items() for part in (f"--{key}", word(value))]
         logger = ("--trainer.logger", "torchqm.learn.logger.RunLogger")
         where = ("--trainer.logger.init_args.save_dir", str(out), "--trainer.logger.init_args.version", name)
-        runs.append(Run(name, labels, seed, ["--config", str(sweep.config), *words, *logger, *where]))
+        runs.append(Run(name, labels, seed, ["--config", str(sweep.config), *words, *logger, *where], digest))
     if len({run.name for run in runs}) < len(runs):
         raise UserError("sweep: two runs would have the same name; give each set-up and each value once")
     return runs
