@@ -260,7 +260,7 @@ def whole_pair(data: dict[str, Any]) -> str:
             f"{row['seconds']:.1f}",
             f"{row['times_torchqm']:.1f}",
             f"{row['plain']:.4f}",
-            f"{row['peak_mib'] / 1024:.1f}",
+            "" if row["peak_mib"] is None else f"{row['peak_mib'] / 1024:.1f}",
         ]
         lines.append(_row([name, str(len(row["all_seconds"])), *cells]))
     return "\n".join(lines)
