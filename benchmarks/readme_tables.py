@@ -274,7 +274,7 @@ def growth(data: dict[str, Any]) -> str:
         for part, words in (("basis", f"{data['k']} eigenpairs"), ("match", "both maps of a pair"))
     ]
     return (
-        f"Growth, `{data['command']}`, {data['threads']} threads, a quadruped subdivided again and again: {'; '.join(each)} (fitted from 4,000 vertices on).\n\n"
+        f"Growth, `{data['command']}`, one thread, a quadruped subdivided again and again: {'; '.join(each)} (fitted from 4,000 vertices on).\n\n"
         "![Seconds and memory against the number of vertices](docs/speed_growth.png)"
     )
 
