@@ -55,7 +55,7 @@ def test_finished_runs_are_skipped_and_the_one_that_was_stopped_begins_anew(tmp_
 
 def test_a_config_that_was_changed_is_not_mixed_with_what_it_was(tmp_path):
     (tmp_path / "model.yaml").write_text("k: 40")
-    (tmp_path / "a.yaml").write_text("model: model.yaml")
+    (tmp_path / "a.yaml").write_text("model: model.yaml\ndata: a.yaml")  # that it names itself does no harm
     sweep = Sweep(tmp_path / "a.yaml", (0,))
     out = tmp_path / "out"
     run_sweep(sweep, out, progress(io.StringIO()), lambda run: {"test_orbit_error": 0.5})
@@ -73,6 +73,9 @@ def test_a_run_that_fails_is_in_the_table_and_the_others_go_on(tmp_path):
 
     rows = run_sweep(plan(), tmp_path, progress(io.StringIO()), train)
     assert [row["status"] for row in rows] == ["done", "failed: the loss is nan at the pairs a -> b", "done", "done"]
+    again = []
+    run_sweep(plan(), tmp_path, progress(io.StringIO()), lambda run: again.append(run.name) or train(run))
+    assert again == ["k=20-seed=0"]  # what failed is tried again, and nothing else
     text = write_tables([row | {"seconds": 2.0} for row in rows], ["model.k"], tmp_path)
     assert text.splitlines() == [
         "| model.k | seeds | seconds | test_orbit_error |",

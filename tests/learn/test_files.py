@@ -49,8 +49,8 @@ def test_a_saved_network_computes_the_same(more, dtype, tmp_path, pairs):
 def test_equal_networks_are_equal_files_and_have_one_digest(tmp_path):
     files = [save_net(net_of(), tmp_path / f"{i}.safetensors", {"b": 1, "a": [2]}).read_bytes() for i in range(2)]
     assert files[0] == files[1]
-    other = [net_of(1), net_of(tau=0.08), net_of().double()]
-    assert len({digest(net) for net in (net_of(), net_of(), *other)}) == 4
+    other = [net_of(1), net_of(tau=0.08), net_of().double(), net_of().bfloat16()]
+    assert len({digest(net) for net in (net_of(), net_of(), *other)}) == 5
 
 
 def test_a_run_folder_gives_its_best_checkpoint(run):

@@ -107,21 +107,21 @@ def _files(args: Sequence[str]) -> Iterator[tuple[Path, dict[str, Any], str]]:
             yield from _file(Path(joined or value), name.removeprefix("--"))
 
 
-def _file(path: Path, group: str) -> Iterator[tuple[Path, dict[str, Any], str]]:
+def _file(path: Path, group: str, above: tuple[Path, ...] = ()) -> Iterator[tuple[Path, dict[str, Any], str]]:
     import yaml
 
-    if not path.is_file():
+    if not path.is_file() or path.resolve() in above:  # a file that names itself would have no end
         return
     try:
         values = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
         yield path, {}, _joined(str(error))
         return
     yield path, {group: values} if group else values, ""
     if isinstance(values, dict):
         for key, value in values.items():
             if isinstance(value, str) and value.endswith((".yaml", ".yml", ".json")):
-                yield from _file(path.parent / value, key)
+                yield from _file(path.parent / value, key, (*above, path.resolve()))
 
 
 def _arguments(class_path: str) -> list[str]:

@@ -225,7 +225,7 @@ def _kept(folder: Path, run: Run) -> Any:
                 )
             if found["arguments"] != list(run.arguments):
                 raise UserError(f"{folder}: has a run with other arguments ({name}); give another --out, or remove it")
-            return found if name == _RESULT else None
+            return found if name == _RESULT and found["status"] == "done" else None  # what failed is tried again
     raise UserError(f"{folder}: exists, but is no run of a sweep; give another --out, or remove it")
 
 

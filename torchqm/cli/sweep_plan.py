@@ -51,11 +51,12 @@ def config_digest(path: Path) -> str:
 
     import yaml
 
-    found = hashlib.sha256()
+    found, seen = hashlib.sha256(), set[Path]()
 
     def add(file: Path) -> None:
-        if not file.is_file():
-            return  # LightningCLI says so
+        if not file.is_file() or file.resolve() in seen:
+            return  # if there is none, LightningCLI says so
+        seen.add(file.resolve())
         text = file.read_text(errors="replace")
         found.update(text.encode())
         try:

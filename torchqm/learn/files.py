@@ -131,7 +131,7 @@ def _digest(options: Mapping[str, Any], state: Mapping[str, Tensor]) -> str:
     for name, value in sorted(state.items()):
         array = value.detach().cpu().contiguous()
         found.update(f"{name} {array.dtype} {tuple(array.shape)};".encode())
-        found.update(array.numpy().tobytes())
+        found.update(array.reshape(-1).view(torch.uint8).numpy().tobytes())  # NumPy has no bfloat16
     return found.hexdigest()
 
 

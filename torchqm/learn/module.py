@@ -96,6 +96,9 @@ class MatchModule(LightningModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
+        for name, value in (("lr", lr), ("weight_decay", weight_decay)):
+            if not 0 <= value < float("inf"):
+                raise ValueError(f"{name}: {value} given, expected a number from 0 on")
         inputs = list(inputs)  # a tuple would not come back from a file as one
         self.save_hyperparameters()
         options = NetOptions(**{field.name: self.hparams[field.name] for field in fields(NetOptions)})
