@@ -48,8 +48,11 @@ def evaluate(args: Sequence[str]) -> "LightningCLI":
     folder = Path(args[0])
     if not (folder / CONFIG_NAME).is_file():
         raise UserError(f"{folder}: no folder of a run; {CONFIG_NAME} is missing")
-    found = sorted((folder / "checkpoints").glob("best*.ckpt")) or sorted((folder / "checkpoints").glob("*.ckpt"))
-    if not found:
-        raise UserError(f"{folder}: no checkpoint in {folder / 'checkpoints'}")
-    own = ["--config", str(folder / CONFIG_NAME), "--ckpt_path", str(found[-1])]
+    from torchqm.learn.files import find_weights
+
+    try:
+        found = find_weights(folder)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    own = ["--config", str(folder / CONFIG_NAME), "--ckpt_path", str(found)]
     return learn(["test", *own, *args[1:]])
