@@ -9,8 +9,10 @@ from references.unchecked import unchecked
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from torchqm.fmap import cholesky
 from torchqm.fmap import rows as module
 from torchqm.fmap.rows import UndeterminedRowsError, solve_rows
+from torchqm.fmap.threads import in_shares
 from torchqm.testing import gradcheck64
 
 
@@ -68,6 +70,54 @@ def test_chunks_change_nothing():
     for other in found[1:]:
         for ours, first in zip(other, found[0], strict=True):
             torch.testing.assert_close(ours, first, atol=1e-13, rtol=1e-13)
+
+
+@pytest.fixture
+def threads_of_torch(monkeypatch):
+    monkeypatch.setattr(module, "_WORTH_THREADS", 0)
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("row_chunk", [None, 6])
+def test_threads_change_nothing_to_the_last_bit(row_chunk, threads_of_torch, monkeypatch):
+    monkeypatch.setitem(cholesky._AT_ONCE, "cpu", 5000)  # more than one part for each
+    inputs = [tensor.requires_grad_() for tensor in problem(2, kx=40, ky=9, c=50)]
+    weight = torch.randn(2, 9, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    found = []
+    for threads in (1, 3):
+        threads_of_torch(threads)
+        fmap = solve(*inputs, row_chunk)
+        found.append([fmap, *torch.autograd.grad(fmap, inputs, weight)])
+        assert torch.get_num_threads() == threads
+    assert all(torch.equal(one, three) for one, three in zip(*found, strict=True))
+
+
+@pytest.mark.parametrize(("row_chunk", "threads"), [(1, 3), (4, 2), (5, 3)])
+def test_all_threads_together_keep_to_the_chunk(row_chunk, threads, threads_of_torch, monkeypatch):
+    threads_of_torch(threads)
+    asked = []
+
+    def spy(run, parts, n):
+        asked.append((n, max(part.stop - part.start for part in parts)))
+        in_shares(run, parts, n)
+
+    monkeypatch.setattr(module, "in_shares", spy)
+    solve(*problem(2, kx=6, ky=9), row_chunk)
+    assert asked
+    for n, rows in asked:
+        assert n * rows <= row_chunk
+        assert n == min(threads, row_chunk)
+
+
+def test_a_small_problem_starts_no_threads(threads_of_torch, monkeypatch):
+    threads_of_torch(2)
+    monkeypatch.setattr(module, "_WORTH_THREADS", 9 * 6**2 + 1)
+    asked = []
+    monkeypatch.setattr(module, "in_shares", lambda run, parts, n: (asked.append(n), in_shares(run, parts, n)))
+    solve(*problem(kx=6, ky=9))
+    assert asked == [1]
 
 
 @pytest.mark.parametrize("row_chunk", [None, 2])

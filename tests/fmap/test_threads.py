@@ -7,7 +7,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from torchqm.fmap.threads import in_parallel, one_thread, workers
+from torchqm.fmap.threads import in_parallel, in_shares, one_thread, workers
 
 
 @pytest.fixture(autouse=True)
@@ -82,3 +82,32 @@ def test_without_workers_one_after_the_other_in_this_thread():
 def test_an_error_of_a_task_comes_out():
     with one_thread(), pytest.raises(KeyError, match="second"):
         in_parallel([lambda: 1, partial({}.__getitem__, "second"), lambda: 3])
+
+
+def test_shares_run_at_the_same_time_without_gradients_and_on_one_thread_each():
+    met, seen, kept = Barrier(2, timeout=10), [], torch.ones(2, requires_grad=True)
+
+    def run(items):
+        met.wait()  # ends only if two run at the same time
+        seen.append((list(items), torch.get_num_threads(), (2 * kept).requires_grad, get_ident()))
+
+    in_shares(run, range(5), 2)
+    assert sorted(items for items, *_ in seen) == [[0, 2, 4], [1, 3]]
+    assert [row[1:3] for row in seen] == [(1, False)] * 2
+    assert len({get_ident(), *(row[3] for row in seen)}) == 3
+    assert torch.get_num_threads() == 2
+
+
+def test_an_error_of_a_share_comes_out_and_threads_are_as_before():
+    def run(items):
+        raise KeyError(f"share of {list(items)}")
+
+    with pytest.raises(KeyError, match=r"share of \[0\]"):
+        in_shares(run, range(2), 2)
+    assert torch.get_num_threads() == 2
+
+
+def test_one_share_is_run_here():
+    seen = []
+    in_shares(lambda items: seen.append((list(items), get_ident())), range(3), 1)
+    assert seen == [([0, 1, 2], get_ident())]

@@ -5,7 +5,7 @@ Each row of a functional map solves ``(gram + diag(d_i)) c_i = r_i``. The solve 
 it as one piece, and the check for undetermined rows runs inside them, too.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import prod
 from typing import Any
 
@@ -16,8 +16,12 @@ from torch import Tensor
 from torchqm.checks import Sizes, enabled, wanted
 from torchqm.fmap.cholesky import factorize, rows_at_once, solve_checked, solve_factored, surely_regular
 from torchqm.fmap.operator import operator
+from torchqm.fmap.threads import in_shares
 
 __all__ = ["UndeterminedRowsError", "solve_rows"]
+
+# Numbers in all systems of a call from which on several threads gain more than they cost. Measured.
+_WORTH_THREADS = 2**20
 
 
 class UndeterminedRowsError(ValueError):
@@ -105,30 +109,43 @@ def _rows_and_factor(
         return rhs.clone(), gram.new_empty((ky, n, kx, kx) if keep else 0)
     systems = gram.reshape(n, kx, kx)
     entries, right = (side.reshape(n, ky, kx).transpose(0, 1) for side in (diagonal, rhs))
-    step = rows_at_once(gram, n, row_chunk or ky)
     factor = gram.new_empty((ky, n, kx, kx) if keep else 0)
-    workspace = gram.new_empty((0 if keep else min(step, ky), n, kx, kx))
     rows = gram.new_empty(ky, n, kx)
     check = check and not surely_regular(systems, entries.amin(0))
     # Without a check only those are found whose factor does not exist.
     undetermined = torch.zeros(ky, n, dtype=torch.bool, device=gram.device)
-    for start in range(0, ky, step):
-        part = slice(start, start + step)
-        lower = factor[part] if keep else workspace[: len(rows[part])]
-        failed = factorize(systems, entries[part], lower)
-        if check:
-            unit = (systems.diagonal(dim1=-2, dim2=-1) + entries[part]).clamp_min(0).sqrt()
-            rows[part], singular = solve_checked(lower, right[part], unit)
-            undetermined[part] = failed | singular
-        else:
-            rows[part] = solve_factored(lower, right[part, ..., None])[..., 0]
-            undetermined[part] = failed
+
+    def solve(parts: Sequence[slice]) -> None:
+        workspace = gram.new_empty((0 if keep else parts[0].stop - parts[0].start, n, kx, kx))
+        for part in parts:
+            lower = factor[part] if keep else workspace[: len(rows[part])]
+            failed = factorize(systems, entries[part], lower)
+            if check:
+                unit = (systems.diagonal(dim1=-2, dim2=-1) + entries[part]).clamp_min(0).sqrt()
+                rows[part], singular = solve_checked(lower, right[part], unit)
+                undetermined[part] = failed | singular
+            else:
+                rows[part] = solve_factored(lower, right[part, ..., None])[..., 0]
+                undetermined[part] = failed
+
+    _in_parts(solve, gram, n, ky, row_chunk or ky)
     if bool(undetermined.any()):
         for name, values in (("descriptors", gram), ("lmbda and eigenvalues", diagonal)):
             if not bool(torch.isfinite(values).all()):
                 raise ValueError(f"the system made of the {name} has entries that are NaN or infinite")
         raise UndeterminedRowsError(undetermined.T.reshape(rhs.shape[:-1]))
     return rows.transpose(0, 1).reshape(rhs.shape).contiguous(), factor
+
+
+def _in_parts(solve: Callable[[Sequence[slice]], None], like: Tensor, n: int, ky: int, row_chunk: int) -> None:
+    """Solve all rows of ``n`` samples, at most ``row_chunk`` at a time; the first part is one of the longest.
+
+    On the CPU several parts run at a time: LAPACK takes one matrix after the other.
+    """
+    several = like.device.type == "cpu" and n * ky * like.shape[-1] ** 2 >= _WORTH_THREADS
+    threads = min(torch.get_num_threads(), row_chunk) if several else 1
+    step = rows_at_once(like, n, row_chunk // threads)
+    in_shares(solve, [slice(start, min(start + step, ky)) for start in range(0, ky, step)], threads)
 
 
 _solve_rows = operator("solve_rows")(_rows_and_factor)
@@ -143,10 +160,12 @@ def _solve_rows_again(rhs: Tensor, factor: Tensor) -> Tensor:
         return rhs.clone()
     right = rhs.reshape(n, ky, kx).transpose(0, 1)[..., None]
     rows = rhs.new_empty(ky, n, kx)
-    step = rows_at_once(rhs, n, ky)
-    for start in range(0, ky, step):  # what the first sweep has read, the second finds in the cache
-        part = slice(start, start + step)
-        rows[part] = solve_factored(factor[part], right[part])[..., 0]
+
+    def solve(parts: Sequence[slice]) -> None:  # what the first sweep of a part has read, the second finds in the cache
+        for part in parts:
+            rows[part] = solve_factored(factor[part], right[part])[..., 0]
+
+    _in_parts(solve, rhs, n, ky, ky)
     return rows.transpose(0, 1).reshape(rhs.shape).contiguous()
 
 

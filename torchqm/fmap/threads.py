@@ -9,8 +9,9 @@ from typing import TypeVar
 import torch
 from threadpoolctl import threadpool_limits
 
-__all__ = ["in_parallel", "one_thread", "workers"]
+__all__ = ["in_parallel", "in_shares", "one_thread", "workers"]
 
+Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _WORKERS: ContextVar[int] = ContextVar("workers", default=1)
@@ -67,3 +68,38 @@ def in_parallel(tasks: Sequence[Callable[[], Result]]) -> list[Result]:
     with ThreadPoolExecutor(n) as pool:
         futures = [pool.submit(copy_context().run, run, task) for task in tasks]
         return [future.result() for future in futures]
+
+
+def in_shares(run: Callable[[Sequence[Item]], None], items: Sequence[Item], n: int) -> None:
+    """Call ``run`` on every n-th item, starting at each of the first n, on n threads of their own.
+
+    For loops over batched LAPACK calls, which torch runs on one thread only, whatever it was given. Each share runs
+    with one thread in torch and without gradients: ``run`` writes into tensors made before. With n = 1 ``run`` gets
+    all items and is called here.
+
+    Example:
+        >>> found = torch.zeros(4)
+        >>> def run(items):
+        ...     for i in items:
+        ...         found[i] = 2 * i
+        >>> in_shares(run, range(4), 2)
+        >>> found.tolist()
+        [0.0, 2.0, 4.0, 6.0]
+    """
+    before, n = torch.get_num_threads(), min(n, len(items))
+
+    @torch.no_grad()
+    def share(items: Sequence[Item]) -> None:
+        torch.set_num_threads(1)  # of this thread; of those that start later, too, hence again below
+        run(items)
+
+    if n <= 1:
+        run(items)
+        return
+    try:
+        with ThreadPoolExecutor(n) as pool:
+            futures = [pool.submit(share, items[first::n]) for first in range(n)]
+            for future in futures:
+                future.result()
+    finally:
+        torch.set_num_threads(before)
