@@ -163,8 +163,8 @@ def sharpened(
         Paper, section 4.4: a fundamental domain of the quotient is enough.
     """
     k = basis_size([x.basis, y.basis], min(parameters.k_quotient, parameters.k_max))
-    source = symmetrized_basis(x.basis.truncate(k), known_x.group)
-    target = symmetrized_basis(y.basis.truncate(k), known_y.group)
+    bases = ((x.basis.truncate(k), known_x.group), (y.basis.truncate(k), known_y.group))
+    source, target = in_parallel([partial(symmetrized_basis, basis, group) for basis, group in bases])
     places_x, places_y = _half(places[0], known_x), _half(places[1], known_y)
     size = (first.fmap.shape[0], first.fmap.shape[1])
     fmap = two_way_upsample(

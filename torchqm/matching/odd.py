@@ -1,12 +1,14 @@
 """The odd half of a map, and with it the difference between direct and mirrored, once the even half is known."""
 
 from dataclasses import dataclass
+from functools import partial
 
 from jaxtyping import Float
 from torch import Tensor
 
 from torchqm.fmap.refine import nearest_isometry
 from torchqm.fmap.solve import solve_fmap
+from torchqm.fmap.threads import in_parallel
 from torchqm.geometry.mesh import Mesh
 from torchqm.matching.initial import unit_columns_pair
 from torchqm.matching.parameters import MatchError
@@ -81,10 +83,8 @@ def solve_odd(
         )
     pairs = function_pairs(n)
     images = even_y.evecs[:, : fmap_even.shape[0]] @ fmap_even[:, :n]
-    f, g = unit_columns_pair(
-        orientation_coefficients(mesh_x, even_x.evecs[:, :n], pairs, odd_x.evecs),
-        orientation_coefficients(mesh_y, images, pairs, odd_y.evecs),
-    )
+    both = ((mesh_x, even_x.evecs[:, :n], pairs, odd_x.evecs), (mesh_y, images, pairs, odd_y.evecs))
+    f, g = unit_columns_pair(*in_parallel([partial(orientation_coefficients, *one) for one in both]))
     fmap = nearest_isometry(
         solve_fmap(f, g, odd_x.evals, odd_y.evals, commutativity * f.shape[1] / odd_x.k, ridge=1e-9)
     )

@@ -1,8 +1,10 @@
 """From two meshes to all the equally good dense maps, and the same for a collection of poses (paper, section 6.2)."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,7 +27,7 @@ from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.prepared import COST, DETECTION, match_prepared
 from torchqm.matching.quality import commutativity_score, orientation_agreement
 from torchqm.matching.result import MatchResult, SymmetryResult
-from torchqm.matching.shape import N_ANCHORS, PreparedShape, prepare
+from torchqm.matching.shape import N_ANCHORS, PreparedShape, completions, prepare
 from torchqm.matching.steps import StepListener, Steps
 from torchqm.matching.subgroups import first_reflection
 from torchqm.spectral.cache import is_cached
@@ -269,9 +271,15 @@ class Collection:
         return self._symmetries[key][1]
 
     def _find_own(self, how: str, *shapes: PreparedShape) -> None:
-        """:meth:`own_symmetry` of several shapes, at the same time where there are workers."""
+        """:meth:`own_symmetry` of several shapes, at the same time where there are workers.
+
+        Planes of two shapes take unequally long; a worker that is done prepares what the match needs after them.
+        """
         new = [s for s in dict.fromkeys(shapes) if (id(s), how) not in self._symmetries]
         at_once = max(1, len(new)) if workers() > 1 else 1
+        beside: list[Callable[[], None]] = []
+        if workers() > 1 and how == "extrinsic" and self.method == "quotient":
+            beside = completions(new, self.parameters.local_weight > 0)
         for start in range(0, len(new), at_once):
             part, known = new[start : start + at_once], list[KnownSymmetry]()
             for number, shape in enumerate(part):
@@ -281,7 +289,8 @@ class Collection:
                     cost = DETECTION + COST["detect"] * shape.n_verts / 1000
                     self.steps.total += cost  # only now is it known that this is needed: what is left grows by it
                 with self.steps(name, cost):  # the first step is that of all
-                    known = known or in_parallel([partial(self._own, how, s) for s in part])
+                    tasks: list[Callable[[], Any]] = [*(partial(self._own, how, s) for s in part), *beside]
+                    known = known or in_parallel(tasks)[: len(part)]
                 self._symmetries[(id(shape), how)] = (shape, known[number])
 
     def _own(self, how: str, shape: PreparedShape) -> KnownSymmetry:

@@ -1,6 +1,7 @@
 """Quotient-space matching of two shapes with known symmetry (paper, section 4, Algorithm 1)."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int
@@ -8,6 +9,7 @@ from torch import Tensor
 
 from torchqm.fmap.convert import deltas, fmap_to_p2p, nearest_used
 from torchqm.fmap.refine import correspondence_fmap, growing_sizes, quotient_icp, upsample
+from torchqm.fmap.threads import in_parallel
 from torchqm.fmap.two_way import Places, two_way_upsample
 from torchqm.matching.described import pair_descriptors
 from torchqm.matching.initial import basis_size, curvature_descriptors, fmap_from_coefficients
@@ -89,8 +91,8 @@ def match_quotient(
         Paper, section 4.3 and 4.4.
     """
     k = basis_size([x.basis, y.basis], parameters.k if k is None else k)
-    source = symmetrized_basis(x.basis.truncate(k), group_x)
-    target = symmetrized_basis(y.basis.truncate(k), group_y)
+    bases = ((x.basis.truncate(k), group_x), (y.basis.truncate(k), group_y))
+    source, target = in_parallel([partial(symmetrized_basis, basis, group) for basis, group in bases])
     if values is None:
         described = pair_descriptors(x, y, parameters, k).coefficients
     else:
@@ -186,15 +188,16 @@ def pair_places(x: PreparedShape, y: PreparedShape, parameters: MatchParameters)
         y: the other.
         parameters: ``local_weight`` (0: there are no features), ``n_samples``, ``k_max`` are used.
     """
-    ids = [x.anchors, y.anchors]
+    shapes = (x,) if x is y else (x, y)
+    ids = [s.anchors for s in shapes]
     if parameters.local_weight == 0:
         features = [torch.zeros(len(i), 0, dtype=x.basis.evecs.dtype) for i in ids]
     else:
-        bases = [s.basis.truncate(min(parameters.k_max, s.basis.k)) for s in (x, y)]
+        bases = [s.basis.truncate(min(parameters.k_max, s.basis.k)) for s in shapes]
         oriented = x.oriented and y.oriented
-        features = local_features(bases, [x.curvature, y.curvature], ids, oriented)
-    first, second = (Places(i, f, min(parameters.n_samples, len(i))) for i, f in zip(ids, features, strict=True))
-    return first, second
+        features = local_features(bases, [s.curvature for s in shapes], ids, oriented)
+    places = [Places(i, f, min(parameters.n_samples, len(i))) for i, f in zip(ids, features, strict=True)]
+    return places[0], places[-1]
 
 
 def _icp_at_100_and(

@@ -20,7 +20,7 @@ from torchqm.spectral.cache import cache_folder, cached_basis
 from torchqm.spectral.eigen import eigenbasis_and_note
 from torchqm.spectral.features import smooth_curvature
 
-__all__ = ["N_ANCHORS", "PreparedShape", "complete", "prepare"]
+__all__ = ["N_ANCHORS", "PreparedShape", "complete", "completions", "prepare"]
 
 N_ANCHORS = 5000
 """Vertices of the target among which refinement steps look for partners, and around which dense searches look."""
@@ -90,11 +90,19 @@ def complete(shapes: Sequence[PreparedShape], curvature: bool = True) -> None:
         shapes: the shapes.
         curvature: whether theirs is going to be used.
     """
+    in_parallel(completions(shapes, curvature))
+
+
+def completions(shapes: Sequence[PreparedShape], curvature: bool = True) -> list[Callable[[], None]]:
+    """What is left to do for :func:`complete`, as tasks that may run beside others."""
     # Not through the properties: they lock, before Python 3.12 one for all shapes together.
     names = ["search", "curvature"] if curvature else ["search"]
-    todo = [(s, name) for s in dict.fromkeys(shapes) for name in names if name not in s.__dict__]
-    for (shape, name), found in zip(todo, in_parallel([partial(_LAZY[n], s) for s, n in todo]), strict=True):
-        shape.__dict__[name] = found
+    todo = [(shape, name) for shape in dict.fromkeys(shapes) for name in names if name not in shape.__dict__]
+    return [partial(_set, shape, name) for shape, name in todo]
+
+
+def _set(shape: PreparedShape, name: str) -> None:
+    shape.__dict__[name] = _LAZY[name](shape)
 
 
 def prepare(
