@@ -53,6 +53,10 @@ def results(out):
     return {str(p.relative_to(out)): p.stat().st_mtime_ns for p in out.rglob("results/*/*.json")}
 
 
+def runs(out):
+    return json.loads((out / "run.json").read_text())["runs"]
+
+
 def table(out):
     with (out / "pairs.csv").open() as file:
         return {(row["method"], row["source"], row["target"]): row for row in csv.DictReader(file)}
@@ -84,12 +88,16 @@ def test_a_run_writes_everything_and_a_second_runs_nothing(out, scripted, monkey
     assert benchmark(ROOT, "--methods", "scripted", "--limit", 2, "--points", 10, out=out, worst=1) == 0
     assert "2 of 2 results are there" in capsys.readouterr().out
     assert (results(out), len(pairs())) == (before, 2)
+    (run,) = runs(out)  # a run with nothing to do writes none
+    assert (run["results"], run["arguments"]["limit"], run["backend"]) == (2, 2, {"name": "local", "workers": 1})
     # one more pair, one more method: only these
     assert benchmark(ROOT, "--methods", "scripted,descriptors", "--limit", 3, "--points", 10, out=out) == 0
     assert "2 of 6 results are there" in capsys.readouterr().out
     assert len(pairs()) == 3
     assert results(out) | before == results(out)
     assert len(table(out)) == 6
+    assert [row["results"] for row in runs(out)] == [2, 4]
+    assert json.loads((out / "run.json").read_text())["arguments"]["limit"] == 3
 
 
 def test_a_killed_run_is_gone_on_with(out, tmp_path, scripted, capsys):
@@ -122,12 +130,14 @@ main(["benchmark", sys.argv[1], "--methods", "scripted", "--points", "10", "--ou
     before = results(out)
     assert len(before) == 2
     assert not (out / "pairs.csv").exists()
+    assert [row["results"] for row in runs(out)] == [None]
     half = next(out.glob("results/*")) / ".x.json.abc.part"  # what a kill in the middle of writing leaves
     half.write_text("{")
     pairs = scripted()
     assert benchmark(ROOT, "--methods", "scripted", "--points", 10, out=out) == 0
     assert "2 of 6 results are there" in capsys.readouterr().out
     assert len(pairs()) == 4
+    assert [row["results"] for row in runs(out)] == [None, 4]
     assert len(table(out)) == 6
     assert results(out) | before == results(out)  # what was there was not written again
     assert not half.exists()

@@ -124,7 +124,11 @@ def test_a_run_that_loses_workers_has_every_result_once(tmp_path, address, root,
     # Only the pair whose worker was killed in the middle was begun again, not the one that was written but not told.
     assert sorted(asked.values()) == [1, 1, 1, 1, 1, 2]
     assert Path(f"{tmp_path}/log.txt.died").exists()
-    assert json.loads((out / "run.json").read_text())["backend"] == {"name": "dask", "address": address, "workers": 2}
+    assert json.loads((out / "run.json").read_text())["runs"][-1]["backend"] == {
+        "name": "dask",
+        "address": address,
+        "workers": 2,
+    }
     before = {path: path.stat().st_mtime_ns for path in done}
     assert bench(root, out, "tcp://127.0.0.1:1") == 0  # nothing to do: no cluster is needed
     assert (before, pairs()) == ({path: path.stat().st_mtime_ns for path in done}, asked)

@@ -107,6 +107,7 @@ def run(arguments: argparse.Namespace) -> int:
     out = arguments.out
     with _locked(out):
         from torchqm.benchmark.ledger import clean
+        from torchqm.benchmark.runs import begin_run, end_run
 
         clean(out, 3600.0 if dask else 0.0)
         todo = [] if arguments.report else _missing(tasks, arguments.retry)
@@ -116,8 +117,11 @@ def run(arguments: argparse.Namespace) -> int:
             with _backend(arguments, todo) as (run_all, backend), Progress() as progress:
                 if arguments.retry:
                     _forget(todo)
-                _do(todo, len(tasks), run_all, progress)
-            return _report(arguments, tasks, published, title, backend)
+                if todo:
+                    begin_run(out, as_plain(arguments), backend)
+                    _do(todo, len(tasks), run_all, progress)
+                    end_run(out, len(todo), backend)
+            return _report(arguments, tasks, published, title)
         except KeyboardInterrupt:
             left = len(_missing(todo, False))
             print(
@@ -224,8 +228,6 @@ def _do(todo: "Sequence[Task]", total: int, run_all: _RunAll, progress: Progress
     from torchqm.benchmark import run_task
     from torchqm.benchmark.run import fail_task
 
-    if not todo:
-        return
     there, kinds = total - len(todo), [(task.matcher.name, task.kind) for task in todo]
     left = {kind: kinds.count(kind) for kind in kinds}
     spent: dict[tuple[str, str], list[float]] = {}
@@ -253,13 +255,12 @@ def _report(
     tasks: "Sequence[Task]",
     published: "Sequence[PublishedRows]",
     title: str,
-    backend: dict[str, Any],
 ) -> int:
     """Write the tables, figures and the page."""
     from torchqm.benchmark import write_page, write_summary
     from torchqm.benchmark.ledger import LedgerError
     from torchqm.benchmark.page import draw_picture
-    from torchqm.matching.result import write_json
+    from torchqm.benchmark.runs import write_report
 
     out = arguments.out
     jobs = min(arguments.jobs or usable_cores(), usable_cores())
@@ -277,25 +278,11 @@ def _report(
         if str(error).startswith("rows:"):
             raise UserError(f"{out}: no result is there yet") from error
         raise
-    write_json(out / "run.json", {"arguments": as_plain(arguments), "backend": backend, **_provenance()})
+    write_report(out, as_plain(arguments))
     print((out / "table.md").read_text("utf-8"))
     failed = sum(bool(row.get("reason")) for row in rows)
     print(f"written: {', '.join(str(out / name) for name in (*FILES, *sorted(set(files) - {'csv', 'table'})))}")
     return 1 if failed else 0
-
-
-def _provenance() -> dict[str, Any]:
-    import os
-    import platform
-    from importlib import metadata
-
-    from torchqm.version import __version__
-
-    packages = ("torch", "numpy", "scipy")
-    versions = {"torchqm": __version__, "python": platform.python_version()}
-    versions |= {name: metadata.version(name) for name in packages}
-    machine = {"system": f"{platform.system()} {platform.machine()}", "cpus": os.cpu_count()}
-    return {"versions": versions, "machine": machine}
 
 
 def _count(text: str) -> int:

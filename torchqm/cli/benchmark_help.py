@@ -35,7 +35,7 @@ files written to OUT:
   table.md        means over the pairs
   figure6_orbit, figure8_symmetry, figure10_map, figure_plain (.png and .svg)
   worst.html      pictures of the worst pairs of each method
-  run.json        the command, where it was run, versions and machine
+  run.json        the commands that wrote results here: when, where, versions, machine
 
 backends: tasks are run in processes of this machine, or by --backend dask --address
 tcp://HOST:PORT on the workers of a Dask cluster (pip install 'torchqm[distributed]'), one at
