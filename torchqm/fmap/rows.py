@@ -118,14 +118,14 @@ def _rows_and_factor(
     def solve(parts: Sequence[slice]) -> None:
         workspace = gram.new_empty((0 if keep else parts[0].stop - parts[0].start, n, kx, kx))
         for part in parts:
-            lower = factor[part] if keep else workspace[: len(rows[part])]
-            failed = factorize(systems, entries[part], lower)
+            upper = factor[part] if keep else workspace[: len(rows[part])]
+            failed = factorize(systems, entries[part], upper)
             if check:
                 unit = (systems.diagonal(dim1=-2, dim2=-1) + entries[part]).clamp_min(0).sqrt()
-                rows[part], singular = solve_checked(lower, right[part], unit)
+                rows[part], singular = solve_checked(upper, right[part], unit)
                 undetermined[part] = failed | singular
             else:
-                rows[part] = solve_factored(lower, right[part, ..., None])[..., 0]
+                rows[part] = solve_factored(upper, right[part, :, None])[:, :, 0]
                 undetermined[part] = failed
 
     _in_parts(solve, gram, n, ky, row_chunk or ky)
@@ -158,12 +158,12 @@ def _solve_rows_again(rhs: Tensor, factor: Tensor) -> Tensor:
     n = factor.shape[1]
     if rhs.numel() == 0:
         return rhs.clone()
-    right = rhs.reshape(n, ky, kx).transpose(0, 1)[..., None]
+    right = rhs.reshape(n, ky, kx).transpose(0, 1)[:, :, None]
     rows = rhs.new_empty(ky, n, kx)
 
     def solve(parts: Sequence[slice]) -> None:  # what the first sweep of a part has read, the second finds in the cache
         for part in parts:
-            rows[part] = solve_factored(factor[part], right[part])[..., 0]
+            rows[part] = solve_factored(factor[part], right[part])[:, :, 0]
 
     _in_parts(solve, rhs, n, ky, ky)
     return rows.transpose(0, 1).reshape(rhs.shape).contiguous()
