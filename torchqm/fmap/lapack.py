@@ -55,7 +55,8 @@ def potrf(systems: Float[Tensor, "N K K"]) -> Int[Tensor, " N"]:
     info, size = torch.zeros(n, dtype=torch.int32), ctypes.c_int(k)
     k_at, stride = ctypes.addressof(size), k * k * systems.element_size()
     at, info_at = systems.data_ptr(), info.data_ptr()
-    for i in range(n if k else 0):  # row by row in memory is column by column in LAPACK, whose lower triangle is ours above
+    # Row by row in memory is column by column in LAPACK: its lower triangle is our upper one.
+    for i in range(n if k else 0):
         call(b"L", k_at, at + i * stride, k_at, info_at + 4 * i)
     return info
 
