@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from torchqm.data import PairDataset, open_shapes, write_split_file
-from torchqm.data.datamodule import EpochSampler, PairDataModule, SwappedTruths
+from torchqm.data.datamodule import EpochSampler, OnceSampler, PairDataModule, SwappedTruths
 from torchqm.data.items import ItemOptions
 from torchqm.data.splits import Split
 
@@ -23,6 +23,38 @@ def test_epochs_have_orders_of_their_own_that_only_the_seed_changes():
     assert orders[0] == orders[2] != orders[1]
     assert sorted(orders[1]) == list(range(20)) == sorted(EpochSampler(20, seed=4))
     assert list(EpochSampler(20, seed=4)) != orders[0]
+
+
+@pytest.mark.parametrize(("size", "replicas"), [(7, 1), (7, 2), (6, 3), (3, 3), (2, 3), (1, 4)])
+def test_where_means_are_taken_no_pair_counts_more_than_another(size, replicas):
+    parts = [OnceSampler(size, replicas, rank) for rank in range(replicas)]
+    counts = torch.bincount(torch.tensor([number for part in parts for number in part]), minlength=size)
+    assert counts.tolist() == [1 if size >= replicas else replicas] * size
+    assert all(len(list(part)) == len(part) > 0 for part in parts)
+    assert all(list(part) == sorted(part) for part in parts)
+
+
+def test_validation_and_test_are_sampled_once_and_lightning_keeps_it_so():
+    data = module(shares=(0.4, 0.6, 0), test_root=ROOT, pairs="all+self")
+    data.setup("fit")
+    for loader in (data.val_dataloader(), data.test_dataloader()):
+        assert isinstance(loader.sampler, OnceSampler)
+        assert isinstance(loader.sampler, torch.utils.data.DistributedSampler)  # others are replaced, with padding
+
+
+def test_pairs_without_a_truth_are_in_a_batch_with_masks_that_say_so():
+    two = "synthetic:kinds=ellipsoid;bodies=2;poses=2;verts=500;triangulation=shared"
+    data = module(root=two, pairs="unordered", truth="optional", batch_size=6)
+    data.setup("fit")
+    (batch,) = data.train_dataloader()
+    names = zip(batch["first"]["name"], batch["second"]["name"], strict=True)
+    within = [a.split("-pose")[0] == b.split("-pose")[0] for a, b in names]
+    assert sorted(within) == [False] * 4 + [True] * 2
+    for side in ("first", "second"):
+        masks = batch[side]["corr_mask"]
+        assert masks.any(-1).tolist() == within
+        wanted = batch["first"]["verts_mask"].sum(-1) * torch.tensor(within)  # triangles are shared: at each vertex
+        assert torch.equal(masks.sum(-1), wanted)
 
 
 def test_batches_are_those_of_the_split_and_its_options(tmp_path):

@@ -72,6 +72,62 @@ def test_a_padded_batch_is_the_mean_of_its_pairs(setup, supervision, truth_form,
             torch.testing.assert_close(errors[name][b], value[0])
 
 
+def without_truth(pair):
+    none = torch.zeros(0, dtype=torch.long)
+    return pair | {side: pair[side] | {"corr": none} for side in ("first", "second")}
+
+
+SUPERVISED = [kind for kind in KINDS if kind[1] != "none"]
+
+
+@pytest.mark.parametrize(("setup", "supervision", "truth_form"), SUPERVISED)
+def test_what_a_pair_without_a_truth_adds_is_what_it_adds_alone(setup, supervision, truth_form, pairs):
+    """So two processes with a pair each have, in the mean, the gradients of one with both."""
+    net = net_of(setup, supervision, truth_form)
+    parts = [pairs[0], without_truth(pairs[1])]
+    losses = [net.losses(collate(given)) for given in (parts, parts[:1], parts[1:])]
+    both, first, second = losses
+    assert set(both) == set(first) == set(second)
+    assert second["l_truth"].item() == 0.0
+    torch.testing.assert_close(both["l_truth"], first["l_truth"] / 2, rtol=1e-9, atol=0.0)
+    grads = [torch.autograd.grad(sum(terms.values()), list(net.parameters())) for terms in losses]
+    for found, one, other in zip(*grads, strict=True):
+        torch.testing.assert_close(found, (one + other) / 2, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize(("setup", "supervision", "truth_form"), SUPERVISED)
+def test_without_any_truth_every_weight_still_has_a_gradient_and_it_is_zero(setup, supervision, truth_form, pairs):
+    none = dict.fromkeys(("w_bij", "w_orth", "w_lap", "w_align"), 0.0)
+    net = net_of(setup, supervision, truth_form, **none)
+    found = {}
+    for name, given in (("with", pairs[:1]), ("without", [without_truth(pairs[0])])):
+        net.zero_grad()
+        sum(net.losses(collate(given)).values()).backward()
+        found[name] = {key: value.grad for key, value in net.named_parameters() if value.grad is not None}
+    assert found["with"].keys() == found["without"].keys() != set()  # else the other processes wait for ever
+    assert all(float(value.abs().max()) == 0.0 for value in found["without"].values())
+    assert any(float(value.abs().max()) > 0.0 for value in found["with"].values())
+
+
+def test_errors_are_those_of_the_pairs_with_a_truth(pairs):
+    net = net_of("quotient+odd")
+    errors = []
+    for given in ([without_truth(pairs[0]), pairs[1]], pairs, [without_truth(pair) for pair in pairs]):
+        batch = collate(given)
+        errors.append(net.errors(batch, net(batch["first"], batch["second"])))
+    some, every, none = errors
+    for name, value in some.items():
+        assert torch.equal(value, every[name][1:])
+        assert none[name].shape == (0,)
+
+
+def test_a_batch_without_truths_in_it_at_all_is_named(pairs):
+    batch = collate([{side: {k: v for k, v in pair[side].items() if k != "corr"} for side in ("first", "second")}
+                     for pair in pairs])  # fmt: skip
+    with pytest.raises(ValueError, match="corr: the pairs have none, but a supervision needs it"):
+        net_of("quotient", "orbit").losses(batch)
+
+
 def swapped(pair):
     second = pair["second"]
     return pair | {"second": second | {"corr": second["group"][1][second["corr"]]}}

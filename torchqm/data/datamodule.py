@@ -20,7 +20,7 @@ from torchqm.data.layouts import open_shapes
 from torchqm.data.pairs import choose_pairs
 from torchqm.data.splits import Split, draw_split, own_split, read_split_file
 
-__all__ = ["EpochSampler", "PairDataModule", "SwappedTruths"]
+__all__ = ["EpochSampler", "OnceSampler", "PairDataModule", "SwappedTruths"]
 
 Item = dict[str, Any]
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -50,10 +50,7 @@ class EpochSampler(DistributedSampler[int]):
     """
 
     def __init__(self, size: int, seed: int = 0, replicas: int | None = None, rank: int | None = None) -> None:
-        if replicas is None:
-            spread = is_available() and is_initialized()
-            replicas, rank = (get_world_size(), get_rank()) if spread else (1, 0)
-        super().__init__(range(size), replicas, rank, seed=seed)  # type: ignore[arg-type]
+        super().__init__(range(size), *_processes(replicas, rank), seed=seed)  # type: ignore[arg-type]
         self.size = size
 
     def __iter__(self) -> Iterator[int]:
@@ -61,6 +58,42 @@ class EpochSampler(DistributedSampler[int]):
         order = torch.randperm(self.size, generator=generator).tolist()
         order += order * (self.total_size // max(self.size, 1))
         return iter(order[: self.total_size][self.rank :: self.num_replicas])
+
+
+class OnceSampler(DistributedSampler[int]):
+    """All in their order, each in one process only: where means are taken, none may count twice.
+
+    torch's own sampler takes the first again until all processes have as many. Where there are fewer than processes,
+    each process takes all of them, which leaves every mean as it is and no process without work.
+
+    Args:
+        size: how many.
+        replicas: processes; those of torch.distributed if not given, one if it does not run.
+        rank: number of this process.
+
+    Example:
+        >>> [list(OnceSampler(5, replicas=2, rank=rank)) for rank in (0, 1)]
+        [[0, 2, 4], [1, 3]]
+        >>> [list(OnceSampler(2, replicas=3, rank=rank)) for rank in (0, 1, 2)]
+        [[0, 1], [0, 1], [0, 1]]
+    """
+
+    def __init__(self, size: int, replicas: int | None = None, rank: int | None = None) -> None:
+        super().__init__(range(size), *_processes(replicas, rank), shuffle=False)  # type: ignore[arg-type]
+        self._own = range(self.rank, size, self.num_replicas) if size >= self.num_replicas else range(size)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._own)
+
+    def __len__(self) -> int:
+        return len(self._own)
+
+
+def _processes(replicas: int | None, rank: int | None) -> tuple[int, int | None]:
+    """How many there are, and the number of this one."""
+    if replicas is not None:
+        return replicas, rank
+    return (get_world_size(), get_rank()) if is_available() and is_initialized() else (1, 0)
 
 
 class SwappedTruths(Dataset[Item]):
@@ -230,7 +263,7 @@ class PairDataModule(LightningDataModule):
         return DataLoader(
             pairs,
             batch_size=given["batch_size"],
-            sampler=EpochSampler(len(pairs), given["seed"]) if part == "train" else None,
+            sampler=EpochSampler(len(pairs), given["seed"]) if part == "train" else OnceSampler(len(pairs)),
             num_workers=given["workers"],
             persistent_workers=given["workers"] > 0,
             collate_fn=_batch,
