@@ -5,6 +5,7 @@ from torchqm.data import PairDataset, open_shapes, write_split_file
 from torchqm.data.datamodule import EpochSampler, OnceSampler, PairDataModule, SwappedTruths
 from torchqm.data.items import ItemOptions
 from torchqm.data.splits import Split
+from torchqm.fmap.orbit_truth import orbit_members
 
 ROOT = "synthetic:kinds=ellipsoid;poses=3;verts=500;triangulation=shared"
 NAMES = [f"ellipsoid-0-pose{pose}" for pose in range(3)]
@@ -97,6 +98,19 @@ def test_truths_are_swapped_in_the_share_that_was_asked_for():
         SwappedTruths(pairs, 1.5)
 
 
+@pytest.mark.parametrize(("triangulation", "same"), [("shared", True), ("own", False)])
+def test_orbits_of_swapped_truths_are_the_same_where_the_group_is_exact(triangulation, same):
+    """Why a supervision up to symmetry moves at all under swaps, and why configs/sweep/swapped.yaml shares them."""
+    root = f"synthetic:kinds=biped;poses=2;verts=500;triangulation={triangulation}"
+    pairs = PairDataset(open_shapes(root), "unordered", options=ItemOptions(keys=("group", "corr")))
+    true, wrong = pairs[0]["second"], SwappedTruths(pairs, 1.0)[0]["second"]
+    orbits = [orbit_members(side["corr"], side["group"]) for side in (true, wrong)]
+    assert not torch.equal(true["corr"], wrong["corr"])
+    assert torch.equal(*orbits) == same
+    mirror = true["group"][1]
+    assert torch.equal(mirror[mirror], torch.arange(len(mirror))) == same
+
+
 def test_only_training_pairs_are_swapped():
     data = module(shares=(0.4, 0.6, 0), swapped=1.0, pairs="all+self")
     data.setup("fit")
@@ -104,9 +118,33 @@ def test_only_training_pairs_are_swapped():
     assert isinstance(data.parts["validation"], PairDataset)
 
 
+def test_only_the_classes_that_are_named_are_used(tmp_path):
+    root = "synthetic:kinds=ellipsoid;bodies=3;poses=2;verts=500;triangulation=shared"
+    chosen = ["ellipsoid-0", "ellipsoid-2"]
+    data = module(root=root, classes=chosen, pairs="all", cache_dir=str(tmp_path))
+    data.prepare_data()
+    assert len(list(tmp_path.rglob("*.npz"))) == 4
+    data.setup("fit")
+    assert {name for pair in data.parts["train"].pairs for name in pair} == {
+        f"{cls}-pose{pose}" for cls in chosen for pose in (0, 1)
+    }
+    whole = module(root=root, classes=chosen, shares=(0.5, 0.5, 0), whole_classes=True)
+    whole.setup("fit")
+    assert [len(whole.parts[part].pairs) for part in ("train", "validation")] == [2, 2]  # of two classes, not of three
+    names = [f"ellipsoid-{body}-pose{pose}" for body in range(3) for pose in (0, 1)]
+    split = write_split_file(tmp_path / "s.yaml", Split(train=tuple(names[:4]), validation=tuple(names[4:])))
+    own = module(root=root, classes=chosen[:1], split=str(split))
+    own.setup("fit")
+    assert {name for pair in own.parts["train"].pairs for name in pair} == set(names[:2])
+    assert own.parts["validation"] is None
+    with pytest.raises(ValueError, match=r"classes: synthetic:.* has no 'elipsoid-1'; the nearest is 'ellipsoid-1'"):
+        module(root=root, classes=["elipsoid-1"]).setup("fit")
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
+        ({"classes": []}, "classes: none given; null stands for all"),
         ({"dtype": "half"}, "dtype: 'half' given, allowed are float32, float64"),
         ({"batch_size": 0}, "batch_size=0"),
         ({"swapped": 0.5, "truth": "none"}, "swapped: needs a truth"),

@@ -6,7 +6,7 @@ from pytorch_lightning import Callback, Trainer
 from torch.utils.data import DataLoader
 
 from torchqm.data import collate
-from torchqm.learn import MatchModule
+from torchqm.learn import MatchModule, save_net
 from torchqm.learn.callbacks import LastEpoch
 from torchqm.learn.faults import StepError
 
@@ -109,6 +109,30 @@ def test_what_is_logged_are_the_losses_and_errors_of_the_network(whole, pairs):
     assert run.callback_metrics["val_orbit_error"].item() == pytest.approx(wanted, rel=1e-4)
     loss = sum(sum(module.net.losses(*pair).values()).item() for pair in each) / len(each)
     assert run.callback_metrics["val_loss"].item() == pytest.approx(loss, rel=1e-4)
+
+
+def test_a_training_begins_with_given_weights_once_and_needs_their_file_no_more(pairs, tmp_path):
+    given = MatchModule("quotient", seed=5, **SMALL)
+    path = save_net(given.net, tmp_path / "net.safetensors")
+    begun = MatchModule("quotient", "orbit", seed=0, start=str(path), **SMALL)
+    assert not same(begun.net, given.net)  # a config that is only looked at reads nothing
+    trainer(tmp_path, 0, checkpoints=False).fit(begun, *loaders(pairs))
+    assert same(begun.net, given.net)
+    trainer(tmp_path, 1).fit(begun, *loaders(pairs))  # goes on from what it is
+    fresh = MatchModule("quotient", "orbit", seed=0, start=str(path), **SMALL)
+    trainer(tmp_path / "fresh", 1, checkpoints=False).fit(fresh, *loaders(pairs))
+    assert same(fresh, begun)
+    path.unlink()
+    resumed = MatchModule("quotient", "orbit", seed=0, start=str(path), **SMALL)
+    run = trainer(tmp_path, 2)
+    run.fit(resumed, *loaders(pairs), ckpt_path=tmp_path / "last.ckpt", weights_only=True)
+    assert run.global_step == 4
+    loaded = MatchModule.load_from_checkpoint(tmp_path / "last.ckpt", weights_only=True)
+    assert same(loaded, resumed)
+    trainer(tmp_path, 0, checkpoints=False).fit(loaded, *loaders(pairs))
+    assert same(loaded, resumed)
+    with pytest.raises(ValueError, match=r"start: .*net.safetensors: no such file"):
+        trainer(tmp_path, 1, checkpoints=False).fit(MatchModule("quotient", start=str(path), **SMALL), *loaders(pairs))
 
 
 def without_truth(pair):

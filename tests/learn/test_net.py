@@ -142,6 +142,30 @@ def test_swapped_truths_change_the_plain_loss_only(setup, supervision, truth_for
     assert (abs(wrong - true) > 1e-3 * true) == (supervision == "plain")
 
 
+ASSIGNMENTS = [kind for kind in SUPERVISED if kind[2] == "assignment"]
+
+
+@pytest.mark.parametrize(("setup", "supervision", "truth_form"), ASSIGNMENTS)
+def test_training_on_swapped_truths_is_the_same_to_the_last_bit_up_to_symmetry_only(
+    setup, supervision, truth_form, pairs
+):
+    """The symmetries of these shapes are exact; then no bit of a gradient tells a truth from its mirror image."""
+    found = []
+    for given in (pairs, [swapped(pairs[0]), pairs[1]]):
+        net = net_of(
+            setup, supervision, truth_form, inputs=("wks", "xyz"), w_bij=0.0, w_orth=0.0, w_lap=0.0, w_align=0.0
+        )
+        net.losses(collate(given))["l_truth"].backward()
+        first = [p.grad.clone() for p in net.parameters() if p.grad is not None]
+        steps(net, collate(given), 3)
+        found.append((first, list(net.state_dict().values())))
+    (true_grads, true_net), (wrong_grads, wrong_net) = found
+    assert any(float(grad.abs().max()) > 0 for grad in true_grads)
+    same = [all(torch.equal(a, b) for a, b in zip(*two, strict=True))
+            for two in ((true_grads, wrong_grads), (true_net, wrong_net))]  # fmt: skip
+    assert same == [supervision == "orbit"] * 2
+
+
 def test_the_joined_map_is_direct_and_the_full_one_is_not(pairs):
     batch = collate(pairs)
     errors = {}

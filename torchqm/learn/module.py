@@ -14,6 +14,7 @@ from torchqm.learn.faults import StepError, pair_names, save_batch
 from torchqm.learn.means import PairMeans, everywhere
 from torchqm.learn.net import MatchNet, has_truth
 from torchqm.learn.options import NetOptions
+from torchqm.learn.start import start_from
 
 __all__ = ["MatchModule"]
 
@@ -38,7 +39,7 @@ class MatchModule(LightningModule):
     With ``Trainer(precision="bf16-mixed")`` the linear layers of the network compute in bfloat16; signatures,
     diffusion, bases, solves and losses stay in float32. It is meant for GPUs: on a CPU a step gets slower by it.
 
-    All arguments but the last three are those of :class:`torchqm.learn.options.NetOptions`.
+    All arguments but the last four are those of :class:`torchqm.learn.options.NetOptions`.
 
     Args:
         setup: ``functional_map``, ``quotient`` or ``quotient+odd``.
@@ -65,6 +66,8 @@ class MatchModule(LightningModule):
         lr: learning rate.
         weight_decay: of Adam (decoupled).
         seed: draws the weights and, anew in each step, what is random in it.
+        start: trained weights to begin with instead of drawn ones, see :func:`torchqm.learn.start.start_from`. They are
+            read when a training begins, and not again where it goes on from a checkpoint or is tested.
 
     Raises:
         ValueError: as :class:`torchqm.learn.options.NetOptions`.
@@ -100,6 +103,7 @@ class MatchModule(LightningModule):
         lr: float = 1e-3,
         weight_decay: float = 0.0,
         seed: int = 0,
+        start: str | None = None,
     ) -> None:
         super().__init__()
         for name, value in (("lr", lr), ("weight_decay", weight_decay)):
@@ -111,16 +115,33 @@ class MatchModule(LightningModule):
         with torch.random.fork_rng(devices=[]):  # the weights depend on the seed alone, not on what was drawn before
             torch.manual_seed(seed)
             self.net = MatchNet(options)
+        self._begun = start is None
         self._folder: Path | None = None
         self._batch: Any = None
         self._means = PairMeans()
         # Whether a truth was in each step of the epoch; None: nobody asks, or no more.
         self._truths: list[bool] | None = None if options.supervision == "none" else []
 
+    def begin(self) -> None:
+        """Read the weights that the training begins with, once; nothing if none are given.
+
+        Raises:
+            ValueError: as :func:`torchqm.learn.start.start_from`.
+        """
+        if not self._begun:
+            start_from(self.net, self.hparams["start"])
+        self._begun = True
+
     def setup(self, stage: str) -> None:
-        """Ask all processes for the folder now: one that fails later cannot."""
+        """Ask all processes for the folder now: one that fails later cannot. Read the weights to begin with."""
         folder = self.trainer.log_dir if self.trainer.loggers else None
         self._folder = None if folder is None else Path(folder)
+        if stage == "fit" and self.trainer.ckpt_path is None:
+            self.begin()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """What comes from a checkpoint has begun."""
+        self._begun = True
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
         """The batch with its tensors on the device; a truth stays where it is, only ``corr`` is computed with."""
