@@ -32,7 +32,7 @@ def made_of(config: Path, root: str | Path, **more: Any) -> dict[str, Any]:
 
 
 def data_digest(shapes: ShapeSet, pairs: Iterable[tuple[str, str]]) -> str:
-    """A digest of meshes and truths: a folder may hold others under the same names. Creatures are as their root says."""
+    """A digest of meshes and truths: a folder may hold others under the same names."""
     found = hashlib.sha256()
     pairs = list(pairs)
     for name in dict.fromkeys(name for pair in pairs for name in pair):

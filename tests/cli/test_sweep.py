@@ -73,7 +73,7 @@ def test_runs_of_another_version_are_not_mixed_with_those_of_this_one(tmp_path, 
         run_sweep(plan(), tmp_path, progress(io.StringIO()), never)
     path = tmp_path / "k=10-seed=0" / "result.json"
     path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "torchqm"}))
-    with pytest.raises(UserError, match=r"has a run of a version of torchqm that did not say so \(result.json\)"):
+    with pytest.raises(UserError, match=r"has a run of an earlier torchqm that did not say so \(result.json\)"):
         run_sweep(plan(), tmp_path, progress(io.StringIO()), never)
     path.write_text('{"config"')
     with pytest.raises(UserError, match=r"result.json: damaged .*delete the folder"):

@@ -77,6 +77,7 @@ def without_truth(pair):
     return pair | {side: pair[side] | {"corr": none} for side in ("first", "second")}
 
 
+TRUTH_ALONE = dict.fromkeys(("w_bij", "w_orth", "w_lap", "w_align"), 0.0)
 SUPERVISED = [kind for kind in KINDS if kind[1] != "none"]
 
 
@@ -97,8 +98,7 @@ def test_what_a_pair_without_a_truth_adds_is_what_it_adds_alone(setup, supervisi
 
 @pytest.mark.parametrize(("setup", "supervision", "truth_form"), SUPERVISED)
 def test_without_any_truth_every_weight_still_has_a_gradient_and_it_is_zero(setup, supervision, truth_form, pairs):
-    none = dict.fromkeys(("w_bij", "w_orth", "w_lap", "w_align"), 0.0)
-    net = net_of(setup, supervision, truth_form, **none)
+    net = net_of(setup, supervision, truth_form, **TRUTH_ALONE)
     found = {}
     for name, given in (("with", pairs[:1]), ("without", [without_truth(pairs[0])])):
         net.zero_grad()
@@ -152,9 +152,7 @@ def test_training_on_swapped_truths_is_the_same_to_the_last_bit_up_to_symmetry_o
     """The symmetries of these shapes are exact; then no bit of a gradient tells a truth from its mirror image."""
     found = []
     for given in (pairs, [swapped(pairs[0]), pairs[1]]):
-        net = net_of(
-            setup, supervision, truth_form, inputs=("wks", "xyz"), w_bij=0.0, w_orth=0.0, w_lap=0.0, w_align=0.0
-        )
+        net = net_of(setup, supervision, truth_form, inputs=("wks", "xyz"), **TRUTH_ALONE)
         net.losses(collate(given))["l_truth"].backward()
         first = [p.grad.clone() for p in net.parameters() if p.grad is not None]
         steps(net, collate(given), 3)

@@ -21,8 +21,8 @@ def test_the_weights_are_those_of_the_file_whatever_is_trained_on(trained):
     options = replace(OPTIONS, setup="quotient", supervision="orbit", w_align=0.0, tau=0.1, dropout=0.5)
     net = MatchNet(options)
     start_from(net, trained[1])
-    for name, value in trained[0].state_dict().items():
-        assert torch.equal(net.state_dict()[name], value), name
+    weights = zip(net.state_dict().values(), trained[0].state_dict().values(), strict=True)
+    assert all(torch.equal(here, there) for here, there in weights)
     assert net.options == options
     assert net.training
 

@@ -243,9 +243,7 @@ def _kept(folder: Path, run: Run) -> Any:
                     "others: take another folder, or delete this one"
                 )
             if found.get("torchqm") != __version__:
-                was = (
-                    f"torchqm {found['torchqm']}" if "torchqm" in found else "a version of torchqm that did not say so"
-                )
+                was = f"torchqm {found['torchqm']}" if "torchqm" in found else "an earlier torchqm that did not say so"
                 raise UserError(
                     f"{folder}: has a run of {was} ({name}), this is {__version__}; its results would be mixed with "
                     "others: take another folder, or delete this one"

@@ -102,8 +102,8 @@ class SwappedTruths(Dataset[Item]):
 
     What a labeller does who does not know which side is left. The pairs and the elements (any but the identity) are
     drawn once, from the seed. Only ``corr`` is swapped; ``truth`` stays as it is. Where the group is one of nearest
-    vertices (creatures with triangles of their own) a swapped truth is rounded once more, so a less exact label; and its
-    orbit is another, since such a table is no exact group.
+    vertices (creatures with triangles of their own) a swapped truth is rounded once more, so a less exact label; and
+    its orbit is another, since such a table is no exact group.
 
     Args:
         pairs: with ``corr`` and ``group``.

@@ -179,8 +179,8 @@ class MatchModule(LightningModule):
         whole = len(self._truths) == self.trainer.num_training_batches
         if whole and not any(everywhere(any(self._truths))):
             raise StepError(
-                f"supervision: {self.hparams['supervision']!r} given, but no training pair has a truth; give others, or "
-                "'none'"
+                f"supervision: {self.hparams['supervision']!r} given, but no training pair has a truth; "
+                "give others, or 'none'"
             )
         self._truths = None if whole else []
 

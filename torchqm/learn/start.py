@@ -5,7 +5,6 @@ from typing import Any
 
 from torchqm.learn.files import load_net
 from torchqm.learn.net import MatchNet
-from torchqm.learn.options import NetOptions
 
 __all__ = ["start_from"]
 
@@ -27,6 +26,7 @@ def start_from(net: MatchNet, path: str | Path) -> None:
         ValueError: there is no such file, it is damaged, or its network is another; ``net`` is as it was.
 
     Example:
+        >>> from torchqm.learn import NetOptions
         >>> net = MatchNet(NetOptions(setup="quotient", supervision="orbit"))
         >>> start_from(net, "builtin")
         >>> start_from(MatchNet(NetOptions(width=64)), "builtin")
@@ -43,7 +43,8 @@ def start_from(net: MatchNet, path: str | Path) -> None:
     faults = [f"{name} is {here[name]} here and {there[name]} there" for name in names if here[name] != there[name]]
     if faults:
         raise ValueError(f"start: {path} holds another architecture: {', '.join(faults)}")
-    net.load_state_dict(other.state_dict())
+    # In their order: with dropout, which has no weights, the layers are numbered otherwise.
+    net.load_state_dict(dict(zip(net.state_dict(), other.state_dict().values(), strict=True)))
 
 
 def _plain(value: Any) -> Any:
