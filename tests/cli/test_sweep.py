@@ -83,6 +83,7 @@ def test_runs_of_another_version_are_not_mixed_with_those_of_this_one(tmp_path, 
 def test_what_is_wrong_in_a_sweep_is_told_in_one_line_with_its_place(tmp_path, capsys):
     (tmp_path / "a.yaml").write_text("data: {root: 'synthetic:'}\n")
     cases = {
+        "config: none.yaml": "s.yaml: config: File does not exist: ",
         "config: 3": "s.yaml: config: 3 given, expected the name of a YAML file",
         "config: a.yaml\nsetups: {half: {model.setpu: quotient}}":
             "s.yaml: setups.half: model.setpu: no such option; the nearest is --model.setup",

@@ -142,6 +142,8 @@ def _in_file(text: str, sweep: Sweep, arguments: argparse.Namespace) -> str:
         return text
     groups = {"options": sweep.options, "grid": sweep.grid}
     groups |= {f"setups.{name}": own for name, own in sweep.setups.items()}
+    if key == "config":
+        return f"{arguments.sweep}: {text.removeprefix('--')}"
     places = [group for group, own in groups.items() if key in own]
     return f"{arguments.sweep}: {places[-1]}: {text.removeprefix('--')}" if places else text
 

@@ -133,11 +133,13 @@ class MatchModule(LightningModule):
         self._begun = True
 
     def setup(self, stage: str) -> None:
-        """Ask all processes for the folder now: one that fails later cannot. Read the weights to begin with."""
+        """Ask all processes for the folder now: one that fails later cannot."""
         folder = self.trainer.log_dir if self.trainer.loggers else None
         self._folder = None if folder is None else Path(folder)
-        if stage == "fit" and self.trainer.ckpt_path is None:
-            self.begin()
+
+    def on_fit_start(self) -> None:
+        """Read the weights to begin with; a checkpoint, if the training goes on from one, has been read before."""
+        self.begin()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """What comes from a checkpoint has begun."""
