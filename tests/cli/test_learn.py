@@ -49,6 +49,13 @@ def test_every_config_is_parsed(name, parser):
     assert ("gradients" in found.data["keys"]) == (found.model.network == "diffusion")
 
 
+def test_configs_of_tosca_have_classes_to_tune_on_only_and_no_root():
+    for path in sorted((CONFIGS / "data").glob("tosca*.yaml")):
+        values = yaml.safe_load(path.read_text())
+        assert set(values["classes"]) <= {"cat", "centaur", "david", "wolf"}, path
+        assert values["root"] == "give --data.root ROOT"  # the error of a run without one says so
+
+
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
