@@ -7,12 +7,13 @@ trained as by `train/fit.py --config configs/experiment/quick.yaml`, with ARGS, 
 and solver with the network left out (`network: none`), so that there is nothing to train. All are tested on the same
 pairs, of unseen bodies and triangulations, or those of --test-root. With --matcher the features are also given to the
 classical matcher as descriptors, without its refinement and with it, the true symmetries being known. Each result is a
-file of its own: after a kill the same command goes on. Writes benchmarks/results/learning.json (or --result).
+file of its own: after a kill the same command goes on. Rows that another config, other data, other ARGS or another
+version made are made again, and a training that they made is refused. Writes benchmarks/results/learning.json (or
+--result).
 Errors are geodesic / sqrt(area), at 100 points of each pair, from torchqm.evaluate.
 """
 
 import argparse
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
@@ -24,6 +25,7 @@ from typing import Any
 import torch
 import yaml
 from common import RESULTS, ROOT, write_json
+from kept import data_digest, kept_rows, made_of, require_same
 
 import torchqm.data.datamodule as datamodule
 from torchqm.benchmark.measure import measure_pair
@@ -31,7 +33,6 @@ from torchqm.benchmark.plan import Settings
 from torchqm.cli.learn import fit
 from torchqm.data import ItemOptions, collate, make_item, open_shapes
 from torchqm.data.pairs import choose_pairs
-from torchqm.geometry.files import write_whole
 from torchqm.learn import LearnedDescriptors, MatchNet, load_net
 from torchqm.learn.files import digest
 from torchqm.learn.options import SETUPS
@@ -113,8 +114,13 @@ class Pairs:
 
 
 def trained(setup: str, seed: int, out: Path, more: list[str]) -> MatchNet:
-    """A network of a set-up, trained now or before; a run that was killed goes on."""
+    """A network of a set-up, trained now or before; a run that was killed goes on.
+
+    Raises:
+        SystemExit: the folder has a training with another config or other arguments, or of another version.
+    """
     folder = out / "runs" / setup / f"seed{seed}"
+    require_same(folder, made_of(CONFIG, data_of(CONFIG)["root"], setup=setup, seed=seed, arguments=more))
     last = folder / "checkpoints" / "last.ckpt"
     logger = {"save_dir": str(out / "runs"), "name": setup, "version": f"seed{seed}"}
     if not (folder / "done").exists():
@@ -125,6 +131,11 @@ def trained(setup: str, seed: int, out: Path, more: list[str]) -> MatchNet:
         fit([*args, *(["--ckpt_path", str(last)] if last.exists() else [])])
         (folder / "done").write_text(f"{perf_counter() - start:.1f}\n")
     return load_net(folder)
+
+
+def data_of(config: Path) -> dict[str, Any]:
+    """What the data file of a config says."""
+    return yaml.safe_load((config.parent / yaml.safe_load(config.read_text())["data"]).read_text())
 
 
 def cases(arguments: argparse.Namespace, pairs: Pairs) -> Iterator[tuple[dict[str, Any], str, Callable[[], Match]]]:
@@ -154,18 +165,6 @@ def cases(arguments: argparse.Namespace, pairs: Pairs) -> Iterator[tuple[dict[st
                     f"{name} {parameters} {digest(net)}",
                     lambda net=net, parameters=parameters: pairs.with_matcher(net, parameters),
                 )
-
-
-def kept(path: Path, about: dict[str, Any], make: Callable[[], list[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """The rows in a file, or made and written to it, if it is not there or of something else."""
-    if path.exists():
-        content = json.loads(path.read_text())
-        if content["about"] == about:
-            return content["rows"]
-    rows = make()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, lambda file: file.write(json.dumps({"about": about, "rows": rows}).encode()))
-    return rows
 
 
 def table(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -204,16 +203,22 @@ def main() -> None:
     parser.add_argument("--matcher", action="store_true", help="also as descriptors in the classical matcher")
     parser.add_argument("more", nargs="*", metavar="ARGS", help="of training, after --")
     arguments = parser.parse_args()
-    data = yaml.safe_load((CONFIG.parent / yaml.safe_load(CONFIG.read_text())["data"]).read_text())
-    root = arguments.test_root or data["test_root"]
+    root = arguments.test_root or data_of(CONFIG)["test_root"]
     cache = arguments.out / "cache"
     pairs = Pairs(root, arguments.pairs, cache, arguments.cache or cache)
+    same = made_of(
+        *(CONFIG, root),
+        data=data_digest(pairs.shapes, pairs.pairs),
+        pairs=pairs.pairs,
+        points=pairs.settings.points,
+        arguments=arguments.more,
+    )
     results = []
     for row, depends, make in cases(arguments, pairs):
-        about = row | {"depends": depends, "root": root, "pairs": arguments.pairs, "points": pairs.settings.points}
+        about = row | {"depends": depends} | same
         name = "-".join(map(str, row.values())).replace(" ", "_")
         path = arguments.out / "results" / f"{Path(root).name if arguments.test_root else 'quick'}-{name}.json"
-        rows = kept(path, about, lambda make=make: pairs.measure(make()))
+        rows = kept_rows(path, about, lambda make=make: pairs.measure(make()))
         results.append(row | {"rows": rows})
         print(row, {name: round(fmean(r[name] for r in rows), 4) for name in NUMBERS}, flush=True)
     rows = table(results)

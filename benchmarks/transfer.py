@@ -4,49 +4,62 @@
 
 Rows: WKS in the network's own solver, the network as it is, and after unsupervised training on the pairs of a class (no
 truth is read), each by its own maps: no refinement, no classical matcher (that is `torchqm benchmark ROOT --methods
-quotient,learned:builtin`). The symmetries are those of the set. Fine-tuning on the pairs that are then measured is fair
-where no truth is used, and said. Writes benchmarks/results/transfer.json (or --result); a kill loses one row at most.
+quotient,learned:builtin`). The symmetries are those of the set. Fine-tuning is `torchqm fit --config
+configs/experiment/finetune.yaml --model.start CHECKPOINT --data.root ROOT --data.classes [CLASS]`, into OUT/runs; on
+the pairs that are then measured it is fair where no truth is used, and said. Writes benchmarks/results/transfer.json
+(or --result); a kill loses one row at most. Rows and trainings of another config, other data or another version are not
+taken for these, see benchmarks/kept.py.
 """
 
 import argparse
-from copy import deepcopy
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from statistics import fmean
-from time import perf_counter
 
-import torch
-from common import RESULTS, write_json
-from learning import NUMBERS, Pairs, kept
+from common import RESULTS, ROOT, write_json
+from kept import data_digest, kept_rows, made_of, require_same
+from learning import NUMBERS, Pairs
 
+from torchqm.cli.learn import fit
+from torchqm.cli.sweep_plan import word
 from torchqm.data.pairs import choose_pairs
-from torchqm.learn import MatchNet, load_net, save_net
+from torchqm.learn import MatchNet, NetOptions, load_net
 from torchqm.learn.files import digest
 
+CONFIG = ROOT / "configs" / "experiment" / "finetune.yaml"
 
-def finetuned(net: MatchNet, pairs: Pairs, cls: str, epochs: int, lr: float, path: Path) -> MatchNet:
-    """The network after unsupervised training on all pairs of a class; from its file if it was made before."""
-    if path.exists():
-        return load_net(path)
-    spec = "within-class+unordered"
-    chosen = [pair for pair in choose_pairs(pairs.shapes, spec) if pairs.shapes.shape_class(pair[0]) == cls]
-    net = deepcopy(net).train()
-    optimizer = torch.optim.AdamW(net.parameters(), lr=lr)
-    start = perf_counter()
-    for epoch in range(epochs):
-        order = torch.randperm(len(chosen), generator=torch.Generator().manual_seed(epoch)).tolist()
-        losses = []
-        for number in order:
-            x, y = (pairs.item(name, net.options.keys, net.options.k) for name in chosen[number])
-            loss = torch.stack(list(net.losses({"first": x, "second": y}).values())).sum()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            losses.append(loss.item())
-        print(f"{cls}, epoch {epoch + 1}: loss {fmean(losses):.2f}, {perf_counter() - start:.0f} s", flush=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save_net(net, path, {"from": digest(net), "class": cls, "epochs": epochs, "lr": lr, "pairs": len(chosen)})
-    return net.eval()
+
+def finetuned(start: str, pairs: Pairs, cls: str, epochs: int, lr: float, out: Path) -> MatchNet:
+    """The network after unsupervised training on all pairs of a class, now or before; a run that was killed goes on.
+
+    Raises:
+        SystemExit: the folder has a training that was made of something else.
+    """
+    net = load_net(start)
+    every = choose_pairs(pairs.shapes, "within-class+unordered")
+    chosen = [pair for pair in every if pairs.shapes.shape_class(pair[0]) == cls]
+    about = made_of(
+        *(CONFIG, pairs.shapes.root),
+        data=data_digest(pairs.shapes, chosen),
+        start=digest(net),
+        cls=cls,
+        epochs=epochs,
+        lr=lr,
+    )
+    folder = out / "runs" / f"{cls}-{digest(net)[:8]}-{epochs}-{lr:g}"
+    require_same(folder, about)
+    last = folder / "checkpoints" / "last.ckpt"
+    if not (folder / "done").exists():
+        options = {field.name: getattr(net.options, field.name) for field in fields(NetOptions)}
+        options |= {"supervision": "none", "start": start, "lr": lr}
+        given = {f"model.{name}": list(v) if isinstance(v, tuple) else v for name, v in options.items()}
+        given |= {"data.root": str(pairs.shapes.root), "data.classes": [cls], "data.cache_dir": str(pairs.basis_cache)}
+        given |= {"trainer.max_epochs": epochs, "trainer.logger.init_args.save_dir": str(out / "runs")}
+        given |= {"trainer.logger.init_args.version": folder.name}
+        words = [part for name, value in given.items() for part in (f"--{name}", word(value))]
+        fit(["--config", str(CONFIG), *words, *(["--ckpt_path", str(last)] if last.exists() else [])])
+        (folder / "done").touch()
+    return load_net(last)
 
 
 def main() -> None:
@@ -66,13 +79,19 @@ def main() -> None:
     nets = {"WKS": MatchNet(replace(net.options, network="none")).eval(), "learned": net}
     if arguments.finetune:
         cls = arguments.finetune
-        path = arguments.out / f"{digest(net)[:8]}-{cls}-{arguments.epochs}-{arguments.lr:g}.safetensors"
-        nets[f"fine-tuned on {cls}"] = finetuned(net, pairs, cls, arguments.epochs, arguments.lr, path)
+        given = (arguments.checkpoint, pairs, cls, arguments.epochs, arguments.lr, arguments.out)
+        nets[f"fine-tuned on {cls}"] = finetuned(*given)
+    same = made_of(
+        *(CONFIG, arguments.root),
+        data=data_digest(pairs.shapes, pairs.pairs),
+        pairs=pairs.pairs,
+        points=pairs.settings.points,
+    )
     results = []
     for name, one in nets.items():
-        about = {"net": digest(one), "root": arguments.root, "pairs": [list(pair) for pair in pairs.pairs]}
+        about = {"net": digest(one)} | same
         file = arguments.out / "results" / f"{digest(one)[:16]}-{Path(arguments.pairs).stem}.json"
-        rows = kept(file, about, lambda one=one: pairs.measure(pairs.with_net(one)))
+        rows = kept_rows(file, about, lambda one=one: pairs.measure(pairs.with_net(one)))
         classes = sorted({pairs.shapes.shape_class(row["pair"][0]) for row in rows})
         for cls in ("all", *classes):
             some = [row for row in rows if cls in ("all", pairs.shapes.shape_class(row["pair"][0]))]

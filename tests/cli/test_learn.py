@@ -8,7 +8,7 @@ import yaml
 
 from torchqm.cli.console import UserError
 from torchqm.cli.learn import evaluate, fit, learn
-from torchqm.learn import MatchModule
+from torchqm.learn import MatchModule, load_net
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 FILES = sorted(path.relative_to(CONFIGS).as_posix() for path in CONFIGS.rglob("*.yaml") if path.parent.name != "sweep")
@@ -49,6 +49,13 @@ def test_every_config_is_parsed(name, parser):
     assert ("gradients" in found.data["keys"]) == (found.model.network == "diffusion")
 
 
+def test_configs_of_tosca_have_classes_to_tune_on_only_and_no_root():
+    for path in sorted((CONFIGS / "data").glob("tosca*.yaml")):
+        values = yaml.safe_load(path.read_text())
+        assert set(values["classes"]) <= {"cat", "centaur", "david", "wolf"}, path
+        assert values["root"] == "give --data.root ROOT"  # the error of a run without one says so
+
+
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
@@ -80,6 +87,34 @@ def test_a_run_folder_holds_everything_and_is_tested_from_it(tmp_path, monkeypat
     assert all(torch.equal(a, b) for a, b in zip(module.parameters(), tested.model.parameters(), strict=True))
     assert (folder / "config.yaml").read_bytes() == before
     assert yaml.safe_load((folder.with_name("version_1") / "config.yaml").read_text())["model"]["channels"] == 8
+
+
+def test_fine_tuning_is_a_training_that_begins_with_given_weights(tmp_path, monkeypatch):
+    """As configs/experiment/finetune.yaml has it, on creatures; with no learning rate the weights stay those given."""
+    monkeypatch.chdir(tmp_path)
+    given = ["--config", str(CONFIGS / "experiment" / "finetune.yaml"), "--trainer.max_epochs", "1"]
+    root = "synthetic:kinds=ellipsoid;bodies=2;poses=2;verts=500;triangulation=shared"
+    data = ["--data.root", root, "--data.classes", "[ellipsoid-1]"]
+    with pytest.raises(UserError, match=r"^give --data.root ROOT: no such folder$"):
+        fit(given)
+    for start, message in {
+        str(tmp_path / "none.safetensors"): "start: .*none.safetensors: no such file or run folder",
+        str(CONFIGS / "README.md"): r"start: .*README.md: a trained network is a .safetensors or a .ckpt file",
+    }.items():
+        with pytest.raises(UserError, match=message):
+            fit([*given, *data, "--model.start", start])
+    with pytest.raises(UserError, match="start: builtin holds another architecture: width is 64 here and 128 there"):
+        fit([*given, *data, "--model.width", "64"])
+    done = fit([*given, *data, "--model.lr", "0"])
+    assert {name for pair in done.datamodule.parts["train"].pairs for name in pair} == {
+        "ellipsoid-1-pose0", "ellipsoid-1-pose1"
+    }  # fmt: skip
+    folder = Path(done.trainer.log_dir)
+    assert [path.name for path in (folder / "checkpoints").iterdir()] == ["last.ckpt"]
+    tuned, built_in = load_net(folder), load_net("builtin")
+    assert all(torch.equal(a, b) for a, b in zip(tuned.parameters(), built_in.parameters(), strict=True))
+    again = fit([*given, *data, "--model.start", str(folder)])
+    assert not all(torch.equal(a, b) for a, b in zip(again.model.net.parameters(), built_in.parameters(), strict=True))
 
 
 def test_a_folder_that_is_no_run_is_named(tmp_path):

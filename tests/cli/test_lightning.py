@@ -37,19 +37,44 @@ def logged(folder):
     return [{key: v for row in rows if row["epoch"] == epoch for key, v in row.items()} for epoch in (0, 1)]
 
 
-def test_two_processes_train_as_one_with_twice_the_batch(tmp_path):
-    words = arguments(tmp_path, "two", "--data.batch_size", "1", "--trainer.devices", "2", "--trainer.strategy", "ddp")
+def both(tmp_path, *more):
+    """Metrics of one process with two pairs in a batch, and of two with one."""
+    words = [*more, "--data.batch_size", "1", "--trainer.devices", "2", "--trainer.strategy", "ddp"]
+    words = arguments(tmp_path, "two", *words)
     environment = os.environ | {"OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1"}
     command = [sys.executable, "-m", "torchqm", "fit", *words]
     running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
-    fit(arguments(tmp_path, "one", "--data.batch_size", "2", "--trainer.devices", "1"))
-    text, _ = running.communicate(timeout=120)
+    fit(arguments(tmp_path, "one", *more, "--data.batch_size", "2", "--trainer.devices", "1"))
+    text, _ = running.communicate(timeout=600)
     assert running.returncode == 0, text
     assert "distributed_backend=gloo" in text
     assert "MEMBER: 2/2" in text
-    one, two = logged(tmp_path / "one"), logged(tmp_path / "two")
+    return logged(tmp_path / "one"), logged(tmp_path / "two")
+
+
+def test_two_processes_train_as_one_with_twice_the_batch(tmp_path):
+    one, two = both(tmp_path)
     assert set(one[0]) == set(two[0]) >= {"train_loss", "train_l_align", "val_loss", "val_orbit_error"}
     assert one[1]["train_loss"] < one[0]["train_loss"]
     for first, second in zip(one, two, strict=True):
         assert second == pytest.approx(first, rel=1e-9, abs=1e-12)
     assert {path.name for path in (tmp_path / "two").iterdir()} >= {"config.yaml", "versions.json", "curves.png"}
+
+
+def test_two_processes_of_which_one_has_no_truth_in_its_batch(tmp_path):
+    """Two bodies: two of six training pairs have a truth, and one of the three to validate on, where one has more."""
+    names = [[f"ellipsoid-{body}-pose{pose}" for pose in range(4)] for body in (0, 1)]
+    root = "synthetic:kinds=ellipsoid;bodies=2;poses=4;verts=500;triangulation=shared"
+    split = tmp_path / "mixed.yaml"
+    parts = {"train": [*names[0][:2], *names[1][:2]], "validation": [names[0][2], *names[1][2:]]}
+    split.write_text(yaml.safe_dump(parts))
+    one, two = both(
+        tmp_path,
+        *("--data.root", root, "--data.split", str(split), "--data.pairs", "unordered", "--data.truth", "optional"),
+        *("--model.supervision", "orbit", "--model.setup", "quotient", "--model.w_align", "0"),
+        *("--model.w_bij", "0", "--model.w_orth", "0", "--model.w_lap", "0"),  # the truth alone
+    )
+    assert set(one[0]) == set(two[0]) >= {"train_l_truth", "val_l_truth", "val_orbit_error"}
+    assert one[1]["train_l_truth"] < one[0]["train_l_truth"]
+    for first, second in zip(one, two, strict=True):
+        assert second == pytest.approx(first, rel=1e-9, abs=1e-12)

@@ -65,6 +65,49 @@ def test_a_config_that_was_changed_is_not_mixed_with_what_it_was(tmp_path):
         run_sweep(sweep, out, progress(io.StringIO()), never)
 
 
+def test_runs_of_another_version_are_not_mixed_with_those_of_this_one(tmp_path, monkeypatch):
+    run_sweep(plan(), tmp_path, progress(io.StringIO()), lambda run: {"test_orbit_error": 0.5})
+    assert len(run_sweep(plan(), tmp_path, progress(io.StringIO()), never)) == 4
+    monkeypatch.setattr(module, "__version__", "9.9.9")
+    with pytest.raises(UserError, match=r"k=10-seed=0: has a run of torchqm .* \(result.json\), this is 9.9.9; .*del"):
+        run_sweep(plan(), tmp_path, progress(io.StringIO()), never)
+    path = tmp_path / "k=10-seed=0" / "result.json"
+    path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "torchqm"}))
+    with pytest.raises(UserError, match=r"has a run of an earlier torchqm that did not say so \(result.json\)"):
+        run_sweep(plan(), tmp_path, progress(io.StringIO()), never)
+    path.write_text('{"config"')
+    with pytest.raises(UserError, match=r"result.json: damaged .*delete the folder"):
+        run_sweep(plan(), tmp_path, progress(io.StringIO()), never)
+
+
+def test_what_is_wrong_in_a_sweep_is_told_in_one_line_with_its_place(tmp_path, capsys):
+    (tmp_path / "a.yaml").write_text("data: {root: 'synthetic:'}\n")
+    cases = {
+        "config: none.yaml": "s.yaml: config: File does not exist: ",
+        "config: 3": "s.yaml: config: 3 given, expected the name of a YAML file",
+        "config: a.yaml\nsetups: {half: {model.setpu: quotient}}":
+            "s.yaml: setups.half: model.setpu: no such option; the nearest is --model.setup",
+        "config: a.yaml\ngrid: {model.k: [ten]}": "s.yaml: grid: model.k: 'ten' given, expected int",
+    }  # fmt: skip
+    for text, message in cases.items():
+        (tmp_path / "s.yaml").write_text(text)
+        assert main([str(tmp_path / "s.yaml"), "--out", str(tmp_path / "out")]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("sweep: error: ")
+        assert message in line
+    (tmp_path / "s.yaml").write_text("config: a.yaml")
+    assert main([str(tmp_path / "s.yaml"), "--set", "model.setpu=quotient"]) == 2
+    assert "error: --model.setpu: no such option" in capsys.readouterr().err  # not of the file
+    for words, message in (
+        (["--grid", "model.k="], "model.k: no value given"),
+        (["--set", "model.k=[1"], "which is no YAML"),
+        (["--seeds", "-1"], "argument --seeds"),
+    ):
+        with pytest.raises(SystemExit):
+            main(["--config", str(tmp_path / "a.yaml"), *words])
+        assert message in capsys.readouterr().err
+
+
 def test_a_run_that_fails_is_in_the_table_and_the_others_go_on(tmp_path):
     def train(run):
         if run.name == "k=20-seed=0":

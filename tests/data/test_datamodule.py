@@ -2,9 +2,11 @@ import pytest
 import torch
 
 from torchqm.data import PairDataset, open_shapes, write_split_file
-from torchqm.data.datamodule import EpochSampler, PairDataModule, SwappedTruths
+from torchqm.data.datamodule import PairDataModule, SwappedTruths
 from torchqm.data.items import ItemOptions
+from torchqm.data.samplers import OnceSampler
 from torchqm.data.splits import Split
+from torchqm.fmap.orbit_truth import orbit_members
 
 ROOT = "synthetic:kinds=ellipsoid;poses=3;verts=500;triangulation=shared"
 NAMES = [f"ellipsoid-0-pose{pose}" for pose in range(3)]
@@ -14,15 +16,27 @@ def module(**given):
     return PairDataModule(**({"root": ROOT, "k": 8, "shares": (1, 0, 0)} | given))
 
 
-def test_epochs_have_orders_of_their_own_that_only_the_seed_changes():
-    sampler = EpochSampler(20, seed=3)
-    orders = []
-    for epoch in (0, 1, 0):
-        sampler.set_epoch(epoch)
-        orders.append(list(sampler))
-    assert orders[0] == orders[2] != orders[1]
-    assert sorted(orders[1]) == list(range(20)) == sorted(EpochSampler(20, seed=4))
-    assert list(EpochSampler(20, seed=4)) != orders[0]
+def test_validation_and_test_are_sampled_once_and_lightning_keeps_it_so():
+    data = module(shares=(0.4, 0.6, 0), test_root=ROOT, pairs="all+self")
+    data.setup("fit")
+    for loader in (data.val_dataloader(), data.test_dataloader()):
+        assert isinstance(loader.sampler, OnceSampler)
+        assert isinstance(loader.sampler, torch.utils.data.DistributedSampler)  # others are replaced, with padding
+
+
+def test_pairs_without_a_truth_are_in_a_batch_with_masks_that_say_so():
+    two = "synthetic:kinds=ellipsoid;bodies=2;poses=2;verts=500;triangulation=shared"
+    data = module(root=two, pairs="unordered", truth="optional", batch_size=6)
+    data.setup("fit")
+    (batch,) = data.train_dataloader()
+    names = zip(batch["first"]["name"], batch["second"]["name"], strict=True)
+    within = [a.split("-pose")[0] == b.split("-pose")[0] for a, b in names]
+    assert sorted(within) == [False] * 4 + [True] * 2
+    for side in ("first", "second"):
+        masks = batch[side]["corr_mask"]
+        assert masks.any(-1).tolist() == within
+        wanted = batch["first"]["verts_mask"].sum(-1) * torch.tensor(within)  # triangles are shared: at each vertex
+        assert torch.equal(masks.sum(-1), wanted)
 
 
 def test_batches_are_those_of_the_split_and_its_options(tmp_path):
@@ -65,6 +79,19 @@ def test_truths_are_swapped_in_the_share_that_was_asked_for():
         SwappedTruths(pairs, 1.5)
 
 
+@pytest.mark.parametrize(("triangulation", "same"), [("shared", True), ("own", False)])
+def test_orbits_of_swapped_truths_are_the_same_where_the_group_is_exact(triangulation, same):
+    """Why a supervision up to symmetry moves at all under swaps, and why configs/sweep/swapped.yaml shares them."""
+    root = f"synthetic:kinds=biped;poses=2;verts=500;triangulation={triangulation}"
+    pairs = PairDataset(open_shapes(root), "unordered", options=ItemOptions(keys=("group", "corr")))
+    true, wrong = pairs[0]["second"], SwappedTruths(pairs, 1.0)[0]["second"]
+    orbits = [orbit_members(side["corr"], side["group"]) for side in (true, wrong)]
+    assert not torch.equal(true["corr"], wrong["corr"])
+    assert torch.equal(*orbits) == same
+    mirror = true["group"][1]
+    assert torch.equal(mirror[mirror], torch.arange(len(mirror))) == same
+
+
 def test_only_training_pairs_are_swapped():
     data = module(shares=(0.4, 0.6, 0), swapped=1.0, pairs="all+self")
     data.setup("fit")
@@ -72,9 +99,33 @@ def test_only_training_pairs_are_swapped():
     assert isinstance(data.parts["validation"], PairDataset)
 
 
+def test_only_the_classes_that_are_named_are_used(tmp_path):
+    root = "synthetic:kinds=ellipsoid;bodies=3;poses=2;verts=500;triangulation=shared"
+    chosen = ["ellipsoid-0", "ellipsoid-2"]
+    data = module(root=root, classes=chosen, pairs="all", cache_dir=str(tmp_path))
+    data.prepare_data()
+    assert len(list(tmp_path.rglob("*.npz"))) == 4
+    data.setup("fit")
+    assert {name for pair in data.parts["train"].pairs for name in pair} == {
+        f"{cls}-pose{pose}" for cls in chosen for pose in (0, 1)
+    }
+    whole = module(root=root, classes=chosen, shares=(0.5, 0.5, 0), whole_classes=True)
+    whole.setup("fit")
+    assert [len(whole.parts[part].pairs) for part in ("train", "validation")] == [2, 2]  # of two classes, not of three
+    names = [f"ellipsoid-{body}-pose{pose}" for body in range(3) for pose in (0, 1)]
+    split = write_split_file(tmp_path / "s.yaml", Split(train=tuple(names[:4]), validation=tuple(names[4:])))
+    own = module(root=root, classes=chosen[:1], split=str(split))
+    own.setup("fit")
+    assert {name for pair in own.parts["train"].pairs for name in pair} == set(names[:2])
+    assert own.parts["validation"] is None
+    with pytest.raises(ValueError, match=r"classes: synthetic:.* has no 'elipsoid-1'; the nearest is 'ellipsoid-1'"):
+        module(root=root, classes=["elipsoid-1"]).setup("fit")
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
+        ({"classes": []}, "classes: none given; null stands for all"),
         ({"dtype": "half"}, "dtype: 'half' given, allowed are float32, float64"),
         ({"batch_size": 0}, "batch_size=0"),
         ({"swapped": 0.5, "truth": "none"}, "swapped: needs a truth"),

@@ -6,7 +6,7 @@ from pytorch_lightning import Callback, Trainer
 from torch.utils.data import DataLoader
 
 from torchqm.data import collate
-from torchqm.learn import MatchModule
+from torchqm.learn import MatchModule, save_net
 from torchqm.learn.callbacks import LastEpoch
 from torchqm.learn.faults import StepError
 
@@ -109,6 +109,64 @@ def test_what_is_logged_are_the_losses_and_errors_of_the_network(whole, pairs):
     assert run.callback_metrics["val_orbit_error"].item() == pytest.approx(wanted, rel=1e-4)
     loss = sum(sum(module.net.losses(*pair).values()).item() for pair in each) / len(each)
     assert run.callback_metrics["val_loss"].item() == pytest.approx(loss, rel=1e-4)
+
+
+def test_a_training_begins_with_given_weights_once_and_needs_their_file_no_more(pairs, tmp_path):
+    given = MatchModule("quotient", seed=5, **SMALL)
+    path = save_net(given.net, tmp_path / "net.safetensors")
+    begun = MatchModule("quotient", "orbit", seed=0, start=str(path), **SMALL)
+    assert not same(begun.net, given.net)  # a config that is only looked at reads nothing
+    trainer(tmp_path, 0, checkpoints=False).fit(begun, *loaders(pairs))
+    assert same(begun.net, given.net)
+    trainer(tmp_path, 1).fit(begun, *loaders(pairs))  # goes on from what it is
+    fresh = MatchModule("quotient", "orbit", seed=0, start=str(path), **SMALL)
+    trainer(tmp_path / "fresh", 1, checkpoints=False).fit(fresh, *loaders(pairs))
+    assert same(fresh, begun)
+    path.unlink()
+    resumed = MatchModule("quotient", "orbit", seed=0, start=str(path), **SMALL)
+    run = trainer(tmp_path, 2)
+    run.fit(resumed, *loaders(pairs), ckpt_path=tmp_path / "last.ckpt", weights_only=True)
+    assert run.global_step == 4
+    loaded = MatchModule.load_from_checkpoint(tmp_path / "last.ckpt", weights_only=True)
+    assert same(loaded, resumed)
+    trainer(tmp_path, 0, checkpoints=False).fit(loaded, *loaders(pairs))
+    assert same(loaded, resumed)
+    with pytest.raises(ValueError, match=r"start: .*net.safetensors: no such file"):
+        trainer(tmp_path, 1, checkpoints=False).fit(MatchModule("quotient", start=str(path), **SMALL), *loaders(pairs))
+
+
+def without_truth(pair):
+    none = torch.zeros(0, dtype=torch.long)
+    return pair | {side: pair[side] | {"corr": none} for side in ("first", "second")}
+
+
+def test_errors_are_means_over_the_pairs_with_a_truth_and_losses_over_all(pairs, tmp_path):
+    given = [without_truth(pairs[0]), pairs[1], pairs[0]]
+    data = DataLoader(loaders(given)[1].dataset, batch_size=2, collate_fn=collate)
+    module, run = MatchModule("quotient", "orbit", **SMALL), trainer(tmp_path, 1, checkpoints=False)
+    run.validate(module, data, verbose=False)
+    module.eval()
+    each = [(batch, module.net(batch["first"], batch["second"])) for batch in loaders(given)[1]]
+    error = sum(module.net.errors(*pair)["orbit_error"].item() for pair in each[1:]) / 2
+    assert run.callback_metrics["val_orbit_error"].item() == pytest.approx(error, rel=1e-5)
+    for name in ("l_truth", "l_bij"):
+        terms = [module.net.losses(*pair)[name].item() for pair in each]
+        assert run.callback_metrics[f"val_{name}"].item() == pytest.approx(sum(terms) / 3, rel=1e-5)
+    assert module.net.losses(*each[0])["l_truth"] == 0.0
+    run.validate(module, loaders(given[:1])[1], verbose=False)
+    assert "val_loss" in run.callback_metrics
+    assert "val_orbit_error" not in run.callback_metrics
+
+
+def test_a_supervision_without_any_truth_stops_after_the_first_epoch(pairs, tmp_path):
+    none, message = [without_truth(pair) for pair in pairs], "supervision: 'orbit' given, but no training pair has a"
+    run = trainer(tmp_path, 3, checkpoints=False)
+    with pytest.raises(StepError, match=message):
+        run.fit(MatchModule("quotient", "orbit", **SMALL), loaders(none)[0])
+    assert run.current_epoch == 0
+    run = trainer(tmp_path, 2, checkpoints=False)
+    run.fit(MatchModule("quotient", "orbit", **SMALL), loaders([none[0], pairs[1]])[0])
+    assert run.global_step == 4
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_and_names_the_pairs(pairs, tmp_path):

@@ -72,6 +72,62 @@ def test_a_padded_batch_is_the_mean_of_its_pairs(setup, supervision, truth_form,
             torch.testing.assert_close(errors[name][b], value[0])
 
 
+def without_truth(pair):
+    none = torch.zeros(0, dtype=torch.long)
+    return pair | {side: pair[side] | {"corr": none} for side in ("first", "second")}
+
+
+TRUTH_ALONE = dict.fromkeys(("w_bij", "w_orth", "w_lap", "w_align"), 0.0)
+SUPERVISED = [kind for kind in KINDS if kind[1] != "none"]
+
+
+@pytest.mark.parametrize(("setup", "supervision", "truth_form"), SUPERVISED)
+def test_what_a_pair_without_a_truth_adds_is_what_it_adds_alone(setup, supervision, truth_form, pairs):
+    """So two processes with a pair each have, in the mean, the gradients of one with both."""
+    net = net_of(setup, supervision, truth_form)
+    parts = [pairs[0], without_truth(pairs[1])]
+    losses = [net.losses(collate(given)) for given in (parts, parts[:1], parts[1:])]
+    both, first, second = losses
+    assert set(both) == set(first) == set(second)
+    assert second["l_truth"].item() == 0.0
+    torch.testing.assert_close(both["l_truth"], first["l_truth"] / 2, rtol=1e-9, atol=0.0)
+    grads = [torch.autograd.grad(sum(terms.values()), list(net.parameters())) for terms in losses]
+    for found, one, other in zip(*grads, strict=True):
+        torch.testing.assert_close(found, (one + other) / 2, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize(("setup", "supervision", "truth_form"), SUPERVISED)
+def test_without_any_truth_every_weight_still_has_a_gradient_and_it_is_zero(setup, supervision, truth_form, pairs):
+    net = net_of(setup, supervision, truth_form, **TRUTH_ALONE)
+    found = {}
+    for name, given in (("with", pairs[:1]), ("without", [without_truth(pairs[0])])):
+        net.zero_grad()
+        sum(net.losses(collate(given)).values()).backward()
+        found[name] = {key: value.grad for key, value in net.named_parameters() if value.grad is not None}
+    assert found["with"].keys() == found["without"].keys() != set()  # else the other processes wait for ever
+    assert all(float(value.abs().max()) == 0.0 for value in found["without"].values())
+    assert any(float(value.abs().max()) > 0.0 for value in found["with"].values())
+
+
+def test_errors_are_those_of_the_pairs_with_a_truth(pairs):
+    net = net_of("quotient+odd")
+    errors = []
+    for given in ([without_truth(pairs[0]), pairs[1]], pairs, [without_truth(pair) for pair in pairs]):
+        batch = collate(given)
+        errors.append(net.errors(batch, net(batch["first"], batch["second"])))
+    some, every, none = errors
+    for name, value in some.items():
+        assert torch.equal(value, every[name][1:])
+        assert none[name].shape == (0,)
+
+
+def test_a_batch_without_truths_in_it_at_all_is_named(pairs):
+    batch = collate([{side: {k: v for k, v in pair[side].items() if k != "corr"} for side in ("first", "second")}
+                     for pair in pairs])  # fmt: skip
+    with pytest.raises(ValueError, match="corr: the pairs have none, but a supervision needs it"):
+        net_of("quotient", "orbit").losses(batch)
+
+
 def swapped(pair):
     second = pair["second"]
     return pair | {"second": second | {"corr": second["group"][1][second["corr"]]}}
@@ -84,6 +140,28 @@ def test_swapped_truths_change_the_plain_loss_only(setup, supervision, truth_for
         true, wrong = (net.losses(collate(list(given)))["l_truth"].item() for given in (pairs, map(swapped, pairs)))
     assert (abs(wrong - true) < 1e-9 * true) == (supervision == "orbit")
     assert (abs(wrong - true) > 1e-3 * true) == (supervision == "plain")
+
+
+ASSIGNMENTS = [kind for kind in SUPERVISED if kind[2] == "assignment"]
+
+
+@pytest.mark.parametrize(("setup", "supervision", "truth_form"), ASSIGNMENTS)
+def test_training_on_swapped_truths_is_the_same_to_the_last_bit_up_to_symmetry_only(
+    setup, supervision, truth_form, pairs
+):
+    """The symmetries of these shapes are exact; then no bit of a gradient tells a truth from its mirror image."""
+    found = []
+    for given in (pairs, [swapped(pairs[0]), pairs[1]]):
+        net = net_of(setup, supervision, truth_form, inputs=("wks", "xyz"), **TRUTH_ALONE)
+        net.losses(collate(given))["l_truth"].backward()
+        first = [p.grad.clone() for p in net.parameters() if p.grad is not None]
+        steps(net, collate(given), 3)
+        found.append((first, list(net.state_dict().values())))
+    (true_grads, true_net), (wrong_grads, wrong_net) = found
+    assert any(float(grad.abs().max()) > 0 for grad in true_grads)
+    same = [all(torch.equal(a, b) for a, b in zip(*two, strict=True))
+            for two in ((true_grads, wrong_grads), (true_net, wrong_net))]  # fmt: skip
+    assert same == [supervision == "orbit"] * 2
 
 
 def test_the_joined_map_is_direct_and_the_full_one_is_not(pairs):

@@ -73,8 +73,10 @@ class MatchCLI(LightningCLI):
             super().instantiate_classes()
 
     def before_fit(self) -> None:
-        """Open the shapes, so that a fault of the config is told from one of the code."""
+        """Open the shapes and read given weights, so that a fault of the config is told from one of the code."""
         with _values():
+            if self.config_init[str(self.subcommand)]["ckpt_path"] is None:
+                self.model.begin()
             self.datamodule.setup("fit")
 
     def before_test(self) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 from torchqm.cli.console import Progress, UserError
 from torchqm.cli.sweep_plan import Run, Sweep, read_sweep, runs_of, word
+from torchqm.version import __version__
 
 __all__ = ["fit_and_test", "main", "run_sweep", "write_tables"]
 
@@ -39,7 +40,8 @@ def run_sweep(sweep: Sweep, out: Path, progress: Progress, train: Callable[[Run]
         ``seconds`` and the measured values.
 
     Raises:
-        UserError: a folder has a run with other arguments, or something that is no run.
+        UserError: a folder has a run with other arguments, of a config that was changed or of another version of
+            torchqm, or something that is no run.
     """
     runs = runs_of(sweep, out)
     kept = {run.name: _kept(out / run.name, run) for run in runs}
@@ -52,7 +54,8 @@ def run_sweep(sweep: Sweep, out: Path, progress: Progress, train: Callable[[Run]
             folder = out / run.name
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
-            _write(folder / _STARTED, {"arguments": list(run.arguments), "config": run.digest})
+            about = {"arguments": list(run.arguments), "config": run.digest, "torchqm": __version__}
+            _write(folder / _STARTED, about)
             progress.listener(run.name, -1.0, number / len(waiting))
             begin = perf_counter()
             try:
@@ -60,13 +63,7 @@ def run_sweep(sweep: Sweep, out: Path, progress: Progress, train: Callable[[Run]
             except UserError as error:  # such as a loss that is not finite: the other runs may do better
                 values, status = {}, f"failed: {' '.join(str(error).split())}"
             seconds = perf_counter() - begin
-            result = {
-                "arguments": list(run.arguments),
-                "config": run.digest,
-                "status": status,
-                "seconds": seconds,
-                "values": values,
-            }
+            result = {**about, "status": status, "seconds": seconds, "values": values}
             _write(folder / _RESULT, result)
             progress.listener(run.name, seconds, (number + 1) / len(waiting))
         head = {"run": run.name, **run.labels, "seed": run.seed, "status": result["status"]}
@@ -129,10 +126,26 @@ def _sweep(arguments: argparse.Namespace) -> tuple[list[Any], list[str]]:
 
     _quiet()
     for run in runs_of(replace(sweep, seeds=sweep.seeds[:1]), arguments.out):
-        learn(run.arguments, run=False)  # a wrong key is found before the first run, not after it
+        try:
+            learn(run.arguments, run=False)  # a wrong key is found before the first run, not after it
+        except UserError as error:
+            raise UserError(_in_file(str(error), sweep, arguments)) from error
     with Progress() as progress:
         rows = run_sweep(sweep, arguments.out, progress, fit_and_test)
     return rows, [*(["setup"] if sweep.setups else []), *sweep.grid]
+
+
+def _in_file(text: str, sweep: Sweep, arguments: argparse.Namespace) -> str:
+    """The error with the sweep's file and the place in it in front, if the wrong option stands there."""
+    key = text.partition(":")[0].removeprefix("--")
+    if arguments.sweep is None or key in dict(arguments.set) or key in dict(arguments.grid):
+        return text
+    groups = {"options": sweep.options, "grid": sweep.grid}
+    groups |= {f"setups.{name}": own for name, own in sweep.setups.items()}
+    if key == "config":
+        return f"{arguments.sweep}: {text.removeprefix('--')}"
+    places = [group for group, own in groups.items() if key in own]
+    return f"{arguments.sweep}: {places[-1]}: {text.removeprefix('--')}" if places else text
 
 
 def fit_and_test(run: Run) -> dict[str, float]:
@@ -191,7 +204,12 @@ class _Options(argparse.Action):
         if not key or not equals:
             parser.error(f"argument {option}: {values!r} given, expected KEY=VALUE")
         name = str(option).removeprefix("--")
-        value = yaml.safe_load(f"[{text}]") if name == "grid" else yaml.safe_load(text)
+        try:
+            value = yaml.safe_load(f"[{text}]") if name == "grid" else yaml.safe_load(text)
+        except yaml.YAMLError:
+            parser.error(f"argument {option}: {text!r} given for {key}, which is no YAML")
+        if value == []:
+            parser.error(f"argument {option}: {key}: no value given, expected at least one")
         setattr(namespace, name, [*getattr(namespace, name), (key, value)])
 
 
@@ -202,7 +220,10 @@ def _config(arguments: argparse.Namespace) -> Path:
 
 
 def _seeds(text: str) -> list[int]:
-    return [int(word) for word in text.split(",")]
+    seeds = [int(word) for word in text.split(",")]
+    if any(not 0 <= seed < 2**32 for seed in seeds):
+        raise ValueError(text)  # argparse says which argument it was
+    return seeds
 
 
 def _spread(values: Sequence[float]) -> str:
@@ -217,16 +238,32 @@ def _kept(folder: Path, run: Run) -> Any:
         return None
     for name in (_RESULT, _STARTED):
         if (folder / name).is_file():
-            found = json.loads((folder / name).read_text())
+            found = _read(folder / name)
             if found.get("config") != run.digest:
                 raise UserError(
                     f"{folder}: has a run of a config that was changed since ({name}); its results would be mixed with "
                     "others: take another folder, or delete this one"
                 )
-            if found["arguments"] != list(run.arguments):
+            if found.get("torchqm") != __version__:
+                was = f"torchqm {found['torchqm']}" if "torchqm" in found else "an earlier torchqm that did not say so"
+                raise UserError(
+                    f"{folder}: has a run of {was} ({name}), this is {__version__}; its results would be mixed with "
+                    "others: take another folder, or delete this one"
+                )
+            if found.get("arguments") != list(run.arguments):
                 raise UserError(f"{folder}: has a run with other arguments ({name}); give another --out, or remove it")
             return found if name == _RESULT and found["status"] == "done" else None  # what failed is tried again
     raise UserError(f"{folder}: exists, but is no run of a sweep; give another --out, or remove it")
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_text())
+    except ValueError as error:
+        raise UserError(f"{path}: damaged ({error}); delete the folder to have the run made again") from error
+    if not isinstance(found, dict):
+        raise UserError(f"{path}: no result of a run; give another --out, or remove it")
+    return found
 
 
 def _write(path: Path, values: Mapping[str, Any]) -> None:

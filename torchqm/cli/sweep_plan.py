@@ -2,7 +2,7 @@
 
 import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -83,18 +83,29 @@ def read_sweep(path: Path) -> Sweep:
         given = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise UserError(f"{path}: not readable as YAML ({' '.join(str(error).split())})") from error
-    if not isinstance(given, dict) or "config" not in given:
-        raise UserError(f"{path}: expected keys and values, among them 'config'")
+    if not isinstance(given, dict):
+        raise UserError(f"{path}: {_shown(given)} given, expected keys and values, among them 'config'")
     for key in given:
         if key not in _KEYS:
             near = nearest_key(str(key), _KEYS)
             hint = f"the nearest is {near}" if near else f"allowed are {', '.join(_KEYS)}"
             raise UserError(f"{path}: {key}: no such key; {hint}")
-    groups = {"seeds": list, "options": dict, "setups": dict, "grid": dict}
-    _require(path, given, groups)
-    for group, kind in (("setups", dict), ("grid", list)):
+    if "config" not in given:
+        raise UserError(f"{path}: expected keys and values, among them 'config'")
+    wanted: dict[str, _Wanted] = {
+        "config": (_is_name, "the name of a YAML file"),
+        "seeds": (_is_seeds, "a list of whole numbers from 0 on, at least one and each once"),
+        "options": (_is_options, "a mapping of options such as model.lr to values"),
+        "setups": (_is_options, "a mapping of names to options"),
+        "grid": (_is_options, "a mapping of options to lists of values"),
+    }
+    _require(path, given, wanted)
+    for group, one in (
+        ("setups", (_is_options, "a mapping of options such as model.lr to values")),
+        ("grid", (_is_values, "a list of at least one value")),
+    ):
         own = given.get(group, {})
-        _require(path, own, dict.fromkeys(own, kind), f"{group}.")
+        _require(path, own, dict.fromkeys(own, one), f"{group}.")
     return Sweep(**{**given, "config": path.parent / given["config"]})
 
 
@@ -136,8 +147,32 @@ def word(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _require(path: Path, values: Mapping[str, Any], kinds: Mapping[str, type], group: str = "") -> None:
-    for key, kind in kinds.items():
-        if key in values and not isinstance(values[key], kind):
-            wanted = "a list" if kind is list else "a mapping"
-            raise UserError(f"{path}: {group}{key}: {values[key]!r} given, expected {wanted}")
+_Wanted = tuple[Callable[[Any], bool], str]
+
+
+def _require(path: Path, values: Mapping[str, Any], wanted: Mapping[str, _Wanted], group: str = "") -> None:
+    for key, (fits, text) in wanted.items():
+        if key in values and not fits(values[key]):
+            raise UserError(f"{path}: {group}{key}: {_shown(values[key])} given, expected {text}")
+
+
+def _shown(value: Any) -> str:
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and value.strip() != ""
+
+
+def _is_seeds(value: Any) -> bool:
+    numbers = isinstance(value, list) and all(type(seed) is int and 0 <= seed < 2**32 for seed in value)
+    return numbers and 0 < len(value) == len(set(value))
+
+
+def _is_options(value: Any) -> bool:
+    return isinstance(value, dict) and all(_is_name(key) for key in value)
+
+
+def _is_values(value: Any) -> bool:
+    return isinstance(value, list) and value != []

@@ -3,14 +3,14 @@
 It stands here and not in :mod:`torchqm.learn`, since what is learned must not know where shapes come from.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import torch
 from pytorch_lightning import LightningDataModule
-from torch.distributed import get_rank, get_world_size, is_available, is_initialized
-from torch.utils.data import DataLoader, Dataset, DistributedSampler
+from torch.utils.data import DataLoader, Dataset
 
 from torchqm.data.base import ShapeSet
 from torchqm.data.collate import collate
@@ -18,56 +18,22 @@ from torchqm.data.dataset import PairDataset
 from torchqm.data.items import ItemOptions, make_item
 from torchqm.data.layouts import open_shapes
 from torchqm.data.pairs import choose_pairs
-from torchqm.data.splits import Split, draw_split, own_split, read_split_file
+from torchqm.data.samplers import EpochSampler, OnceSampler
+from torchqm.data.splits import PARTS, Split, draw_split, own_split, read_split_file
 
-__all__ = ["EpochSampler", "PairDataModule", "SwappedTruths"]
+__all__ = ["PairDataModule", "SwappedTruths"]
 
 Item = dict[str, Any]
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
-
-
-class EpochSampler(DistributedSampler[int]):
-    """An order that depends on the seed and the number of the epoch alone, so that a run can be resumed at any epoch.
-
-    Of n processes each takes every n-th of the order, so that their batches together are those that one process makes
-    of n times as many (the first are taken again where their number is no multiple of n). Lightning would put a sampler
-    of its own, with another order, around any that is no ``DistributedSampler``.
-
-    Args:
-        size: how many.
-        seed: of the draw.
-        replicas: processes; those of torch.distributed if not given, one if it does not run.
-        rank: number of this process.
-
-    Example:
-        >>> sampler = EpochSampler(4, seed=1)
-        >>> sampler.set_epoch(2)
-        >>> list(sampler) == list(sampler), sorted(sampler)
-        (True, [0, 1, 2, 3])
-        >>> parts = [list(EpochSampler(4, seed=1, replicas=2, rank=rank)) for rank in (0, 1)]
-        >>> [v for pair in zip(*parts) for v in pair] == list(EpochSampler(4, seed=1))
-        True
-    """
-
-    def __init__(self, size: int, seed: int = 0, replicas: int | None = None, rank: int | None = None) -> None:
-        if replicas is None:
-            spread = is_available() and is_initialized()
-            replicas, rank = (get_world_size(), get_rank()) if spread else (1, 0)
-        super().__init__(range(size), replicas, rank, seed=seed)  # type: ignore[arg-type]
-        self.size = size
-
-    def __iter__(self) -> Iterator[int]:
-        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.epoch)
-        order = torch.randperm(self.size, generator=generator).tolist()
-        order += order * (self.total_size // max(self.size, 1))
-        return iter(order[: self.total_size][self.rank :: self.num_replicas])
 
 
 class SwappedTruths(Dataset[Item]):
     """Pairs, a share of them with a truth that is followed by a symmetry of the second shape: left and right swapped.
 
     What a labeller does who does not know which side is left. The pairs and the elements (any but the identity) are
-    drawn once, from the seed. Only ``corr`` is swapped; ``truth`` stays as it is.
+    drawn once, from the seed. Only ``corr`` is swapped; ``truth`` stays as it is. Where the group is one of nearest
+    vertices (creatures with triangles of their own) a swapped truth is rounded once more, so a less exact label; and
+    its orbit is another, since such a table is no exact group.
 
     Args:
         pairs: with ``corr`` and ``group``.
@@ -110,7 +76,8 @@ class PairDataModule(LightningDataModule):
         split: ``draw``, ``own`` (that of the set), or a YAML file of :func:`torchqm.data.write_split_file`.
         shares: of train, validation and test, where the split is drawn.
         whole_classes: draw whole classes: validate and test on bodies never seen.
-        test_root: other shapes to test on, all of them; those of the split if not given.
+        classes: use the shapes of these classes only, before they are split; all if not given.
+        test_root: other shapes to test on, all of them, whatever ``classes`` says; those of the split if not given.
         k: eigenfunctions.
         keys: of the items, see :class:`torchqm.data.ItemOptions`; ``corr`` is added where a truth is read.
         dtype: ``float32`` or ``float64``.
@@ -139,6 +106,7 @@ class PairDataModule(LightningDataModule):
         split: str = "draw",
         shares: Sequence[float] = (0.6, 0.2, 0.2),
         whole_classes: bool = False,
+        classes: Sequence[str] | None = None,
         test_root: str | None = None,
         k: int = 60,
         keys: Sequence[str] = ("mass", "basis", "group"),
@@ -158,7 +126,9 @@ class PairDataModule(LightningDataModule):
             raise ValueError(f"batch_size={batch_size}, workers={workers}: at least 1 pair and 0 workers are needed")
         if swapped and (truth == "none" or ("group" not in keys and "symmetry" not in keys)):
             raise ValueError("swapped: needs a truth and the key 'group'")
-        shares, keys = list(shares), list(keys)
+        shares, keys, classes = list(shares), list(keys), None if classes is None else list(classes)
+        if classes == []:
+            raise ValueError("classes: none given; null stands for all")
         self.save_hyperparameters()
         corr = () if truth == "none" else ("corr",)
         self.options = ItemOptions(keys=(*keys, *corr), k=k, dtype=DTYPES[dtype], cache_dir=cache_dir)
@@ -170,10 +140,13 @@ class PairDataModule(LightningDataModule):
         if given["cache_dir"] is None:
             return
         only = ItemOptions(keys=("evals",), k=given["k"], cache_dir=given["cache_dir"])
-        for root in filter(None, (given["root"], given["test_root"])):
+        for root, classes in ((given["root"], given["classes"]), (given["test_root"], None)):
+            if root is None:
+                continue
             shapes = open_shapes(root)
             for name in dict.fromkeys(name for pair in choose_pairs(shapes, given["pairs"]) for name in pair):
-                make_item(shapes, name, only)
+                if classes is None or shapes.shape_class(name) in classes:
+                    make_item(shapes, name, only)
 
     def setup(self, stage: str) -> None:
         """Open the set and choose the pairs of each part."""
@@ -207,14 +180,20 @@ class PairDataModule(LightningDataModule):
 
     def _split(self, shapes: ShapeSet) -> Split:
         given = self.hparams
+        classes = given["classes"]
+        for cls in classes or ():
+            if cls not in shapes.classes:
+                near = get_close_matches(cls, shapes.classes, 1, 0.5)
+                hint = f"the nearest is {near[0]!r}" if near else f"there are {', '.join(shapes.classes)}"
+                raise ValueError(f"classes: {shapes.root} has no {cls!r}; {hint}")
         if given["split"] == "draw":
-            return draw_split(shapes, given["shares"], given["seed"], given["whole_classes"])
-        if given["split"] == "own":
-            split = own_split(shapes)
-            if split is None:
-                raise ValueError(f"split: 'own' given, but {shapes.root} ships none; allowed are draw and a file")
+            return draw_split(shapes, given["shares"], given["seed"], given["whole_classes"], classes)
+        split = own_split(shapes) if given["split"] == "own" else read_split_file(Path(given["split"]), shapes)
+        if split is None:
+            raise ValueError(f"split: 'own' given, but {shapes.root} ships none; allowed are draw and a file")
+        if classes is None:
             return split
-        return read_split_file(Path(given["split"]), shapes)
+        return Split(*(tuple(v for v in split.part(p) if shapes.shape_class(v) in classes) for p in PARTS))
 
     def _pairs(self, shapes: ShapeSet, names: tuple[str, ...], needed: bool) -> PairDataset | None:
         given = self.hparams
@@ -230,7 +209,7 @@ class PairDataModule(LightningDataModule):
         return DataLoader(
             pairs,
             batch_size=given["batch_size"],
-            sampler=EpochSampler(len(pairs), given["seed"]) if part == "train" else None,
+            sampler=EpochSampler(len(pairs), given["seed"]) if part == "train" else OnceSampler(len(pairs)),
             num_workers=given["workers"],
             persistent_workers=given["workers"] > 0,
             collate_fn=_batch,

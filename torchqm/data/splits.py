@@ -79,6 +79,7 @@ def draw_split(
     shares: Sequence[float] = (0.7, 0.1, 0.2),
     seed: int = 0,
     whole_classes: bool = False,
+    classes: Sequence[str] | None = None,
 ) -> Split:
     """Draw the parts class by class, so that each class is divided by the same shares.
 
@@ -90,6 +91,7 @@ def draw_split(
         shares: of train, validation and test; they sum to 1.
         seed: of the draw.
         whole_classes: give whole classes to the parts instead (to test on classes never seen).
+        classes: those to divide; the others are in no part. All if not given.
 
     Returns:
         The parts, names in the set's order.
@@ -107,7 +109,8 @@ def draw_split(
         raise ValueError(f"shares: given {tuple(shares)}; three numbers >= 0 that sum to 1 are needed")
     groups: dict[str, list[str]] = {}
     for name in shapes.names:
-        groups.setdefault(shapes.shape_class(name), []).append(name)
+        if classes is None or shapes.shape_class(name) in classes:
+            groups.setdefault(shapes.shape_class(name), []).append(name)
     part_of: dict[str, str] = {}
     if whole_classes:
         drawn = _divide(list(groups), shares, seed, "classes")
@@ -115,7 +118,7 @@ def draw_split(
     else:
         for cls, names in groups.items():
             part_of |= _divide(names, shares, seed, cls)
-    return Split(*(tuple(name for name in shapes.names if part_of[name] == part) for part in PARTS))
+    return Split(*(tuple(name for name in shapes.names if part_of.get(name) == part) for part in PARTS))
 
 
 def _divide(items: list[str], shares: Sequence[float], seed: int, salt: str) -> dict[str, str]:

@@ -4,6 +4,8 @@ In all of them ``T = p2p_xy (..., N)`` gives for points x of one shape their tru
 over all vertices or over ``samples (..., N)``, and the ``a_x`` are areas that sum to 1
 (:func:`~torchqm.fmap.orbit_truth.point_weights`). The target's group is a table of vertex maps ``group_y (..., G, Y)``,
 row 0 the identity. Every function returns one value for each shape of the batch; points without truth have weight 0.
+The invariance is as exact as the table is a group: one of nearest vertices sends some mirror images back to a neighbour
+of the vertex they came from, whose orbit is another.
 """
 
 import torch

@@ -11,8 +11,10 @@ from pytorch_lightning import LightningModule
 from torch import Tensor
 
 from torchqm.learn.faults import StepError, pair_names, save_batch
-from torchqm.learn.net import MatchNet
+from torchqm.learn.means import PairMeans, everywhere
+from torchqm.learn.net import MatchNet, has_truth
 from torchqm.learn.options import NetOptions
+from torchqm.learn.start import start_from
 
 __all__ = ["MatchModule"]
 
@@ -23,7 +25,12 @@ class MatchModule(LightningModule):
     Logged are ``train_loss``, ``val_loss`` and ``test_loss`` with their terms (``train_l_bij`` and so on), and where
     pairs have a truth ``plain_error``, ``orbit_error`` (straight lines through space / sqrt(area), see
     :mod:`torchqm.fmap.straight_errors`), ``flipped_map`` and ``flipped_points``, after ``val_`` or ``test_``.
+    Those of validation and test are means over the pairs, over all processes together; errors over the pairs that have
+    a truth, and there are none where no pair has one.
     What a run reports in the end is measured by :mod:`torchqm.evaluate`.
+
+    With a supervision some pairs of a batch, or all, may be without a truth: see :class:`torchqm.learn.net.MatchNet`. A
+    run in which no training pair has one stops after its first epoch.
 
     A run stops where a loss, a gradient or what a layer is given is not finite: before the step is taken, so that the
     weights and all checkpoints are those of the steps before. The pairs are named, and what the step had (batch and
@@ -32,7 +39,7 @@ class MatchModule(LightningModule):
     With ``Trainer(precision="bf16-mixed")`` the linear layers of the network compute in bfloat16; signatures,
     diffusion, bases, solves and losses stay in float32. It is meant for GPUs: on a CPU a step gets slower by it.
 
-    All arguments but the last three are those of :class:`torchqm.learn.options.NetOptions`.
+    All arguments but the last four are those of :class:`torchqm.learn.options.NetOptions`.
 
     Args:
         setup: ``functional_map``, ``quotient`` or ``quotient+odd``.
@@ -59,6 +66,8 @@ class MatchModule(LightningModule):
         lr: learning rate.
         weight_decay: of Adam (decoupled).
         seed: draws the weights and, anew in each step, what is random in it.
+        start: trained weights to begin with instead of drawn ones, see :func:`torchqm.learn.start.start_from`. They are
+            read when a training begins, and not again where it goes on from a checkpoint or is tested.
 
     Raises:
         ValueError: as :class:`torchqm.learn.options.NetOptions`.
@@ -94,6 +103,7 @@ class MatchModule(LightningModule):
         lr: float = 1e-3,
         weight_decay: float = 0.0,
         seed: int = 0,
+        start: str | None = None,
     ) -> None:
         super().__init__()
         for name, value in (("lr", lr), ("weight_decay", weight_decay)):
@@ -105,13 +115,35 @@ class MatchModule(LightningModule):
         with torch.random.fork_rng(devices=[]):  # the weights depend on the seed alone, not on what was drawn before
             torch.manual_seed(seed)
             self.net = MatchNet(options)
+        self._begun = start is None
         self._folder: Path | None = None
         self._batch: Any = None
+        self._means = PairMeans()
+        # Whether a truth was in each step of the epoch; None: nobody asks, or no more.
+        self._truths: list[bool] | None = None if options.supervision == "none" else []
+
+    def begin(self) -> None:
+        """Read the weights that the training begins with, once; nothing if none are given.
+
+        Raises:
+            ValueError: as :func:`torchqm.learn.start.start_from`.
+        """
+        if not self._begun:
+            start_from(self.net, self.hparams["start"])
+        self._begun = True
 
     def setup(self, stage: str) -> None:
         """Ask all processes for the folder now: one that fails later cannot."""
         folder = self.trainer.log_dir if self.trainer.loggers else None
         self._folder = None if folder is None else Path(folder)
+
+    def on_fit_start(self) -> None:
+        """Read the weights to begin with; a checkpoint, if the training goes on from one, has been read before."""
+        self.begin()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """What comes from a checkpoint has begun."""
+        self._begun = True
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
         """The batch with its tensors on the device; a truth stays where it is, only ``corr`` is computed with."""
@@ -130,7 +162,29 @@ class MatchModule(LightningModule):
         """
         with self._named(batch):
             terms = self.net.losses(batch)
-        return self._log("train", terms, batch)
+        if self._truths is not None:
+            self._truths.append(bool(has_truth(batch).any()))
+        loss = self._loss(terms, batch)
+        values = {f"train_{name}": value.detach() for name, value in {"loss": loss, **terms}.items()}
+        self.log_dict(values, on_step=False, on_epoch=True, batch_size=len(batch["first"]["name"]), sync_dist=True)
+        return loss
+
+    def on_train_epoch_end(self) -> None:
+        """Stop a supervised run that no pair supervises.
+
+        Raises:
+            StepError: none of the training pairs of all processes has a truth.
+        """
+        if self._truths is None:
+            return
+        # Of an epoch that began in its middle nothing can be said.
+        whole = len(self._truths) == self.trainer.num_training_batches
+        if whole and not any(everywhere(any(self._truths))):
+            raise StepError(
+                f"supervision: {self.hparams['supervision']!r} given, but no training pair has a truth; "
+                "give others, or 'none'"
+            )
+        self._truths = None if whole else []
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Stop before a gradient that is not finite spoils the weights, and with them the next checkpoint.
@@ -145,36 +199,55 @@ class MatchModule(LightningModule):
             self._stop(f"the gradient of {', '.join(bad)} is not finite", self._batch)
 
     def validation_step(self, batch: Mapping[str, Any], batch_idx: int) -> None:
-        """Log loss and errors."""
-        self._measure("val", batch)
+        """Take loss and errors into the means."""
+        self._measure(batch)
 
     def test_step(self, batch: Mapping[str, Any], batch_idx: int) -> None:
-        """Log loss and errors."""
-        self._measure("test", batch)
+        """Take loss and errors into the means."""
+        self._measure(batch)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam."""
         return torch.optim.AdamW(self.parameters(), lr=self.hparams["lr"], weight_decay=self.hparams["weight_decay"])
 
-    def _measure(self, stage: str, batch: Mapping[str, Any]) -> None:
+    def on_validation_epoch_start(self) -> None:
+        """Begin the means anew."""
+        self._means = PairMeans()
+
+    def on_test_epoch_start(self) -> None:
+        """Begin the means anew."""
+        self._means = PairMeans()
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the means over the pairs of all processes."""
+        self._log_means("val")
+
+    def on_test_epoch_end(self) -> None:
+        """Likewise."""
+        self._log_means("test")
+
+    def _measure(self, batch: Mapping[str, Any]) -> None:
         with self._named(batch):
             matched = self.net(batch["first"], batch["second"])
             terms = self.net.losses(batch, matched)
-        self._log(stage, terms, batch)
-        if "corr" not in batch["first"] or not bool(batch["first"]["corr_mask"].any(-1).all()):
-            return  # a pair without truth has no error
-        errors = self.net.errors(batch, matched)
-        means = {f"{stage}_{name}": value.mean() for name, value in errors.items()}
-        self.log_dict(means, batch_size=len(batch["first"]["name"]), sync_dist=True)
+            errors = self.net.errors(batch, matched) if "corr" in batch["first"] else {}
+        n = len(batch["first"]["name"])
+        for name, value in {"loss": self._loss(terms, batch), **terms}.items():
+            self._means.add(name, value.item() * n, n)
+        for name, value in errors.items():
+            self._means.add(name, value.sum().item(), len(value))
 
-    def _log(self, stage: str, terms: Mapping[str, Tensor], batch: Mapping[str, Any]) -> Tensor:
+    def _log_means(self, stage: str) -> None:
+        dtype = torch.float64 if self.dtype == torch.float64 else torch.float32
+        means = {name: torch.tensor(mean, dtype=dtype) for name, mean in self._means.reduced().items()}
+        # All processes have the same; Lightning wants to be told to take their mean.
+        self.log_dict({f"{stage}_{name}": v.to(self.device) for name, v in means.items()}, batch_size=1, sync_dist=True)
+
+    def _loss(self, terms: Mapping[str, Tensor], batch: Mapping[str, Any]) -> Tensor:
         loss = torch.stack(list(terms.values())).sum()
         if not bool(loss.isfinite()):
             shown = ", ".join(f"{name} {value.item():g}" for name, value in terms.items())
             self._stop(f"the loss is {loss.item():g} ({shown})", batch)
-        n = len(batch["first"]["name"])
-        values = {f"{stage}_{name}": value.detach() for name, value in {"loss": loss, **terms}.items()}
-        self.log_dict(values, on_step=False, on_epoch=True, batch_size=n, sync_dist=True)
         return loss
 
     @contextmanager

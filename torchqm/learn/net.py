@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
@@ -25,7 +25,7 @@ from torchqm.nn import (
     SymmetrizedBasis,
 )
 
-__all__ = ["MatchNet", "Matched"]
+__all__ = ["MatchNet", "Matched", "has_truth"]
 
 Item = Mapping[str, Any]
 
@@ -57,6 +57,8 @@ class MatchNet(nn.Module):
     (:class:`torchqm.nn.FunctionalMapLoss`) and ``l_align`` (:func:`torchqm.fmap.alignment.alignment_energy`) over
     blocks and directions, and with a supervision ``l_truth`` (:class:`torchqm.nn.PointToOrbitLoss`). A plain
     supervision is the same loss with the group of one element, or with the spectral form in the full bases.
+    A pair without a truth has the term 0 and stays in the mean, so that what a pair adds to the gradient does not
+    depend on the others in its batch, nor on which process has them.
 
     Args:
         options: all plain values.
@@ -105,6 +107,9 @@ class MatchNet(nn.Module):
         Args:
             batch: pairs of :func:`torchqm.data.collate`; with a supervision, both shapes have ``corr``.
             matched: what :meth:`forward` made of it, if that is known already.
+
+        Raises:
+            ValueError: a supervision, and the batch has no ``corr`` at all.
         """
         found = self(batch["first"], batch["second"]) if matched is None else matched
         with _whole_precision(batch["first"]):
@@ -134,12 +139,18 @@ class MatchNet(nn.Module):
 
     @torch.no_grad()
     def errors(self, batch: Mapping[str, Any], matched: Matched) -> dict[str, Float[Tensor, " B"]]:
-        """Quick errors of the point maps, for each pair: :func:`torchqm.fmap.straight_errors.error_means`."""
+        """Quick errors of the point maps, for each pair with a truth: :func:`torchqm.fmap.straight_errors.error_means`.
+
+        In the order of the pairs, those without a truth left out; empty if no pair has one.
+        """
         x, y = batch["first"], batch["second"]
+        there = has_truth(batch)
         with _whole_precision(x):
             p2p = matched.maps.points(y["verts_mask"])
-        errors = straight_errors(p2p, y["corr"], x["corr"], y["verts"], y["mass"], y["group"])
-        return error_means(errors, point_weights(y["corr"], errors, x["mass"], x["corr"], x["corr_mask"]))
+        x_corr, x_mass, x_mask = (x[name][there] for name in ("corr", "mass", "corr_mask"))
+        y_corr, verts, mass, group = (y[name][there] for name in ("corr", "verts", "mass", "group"))
+        errors = straight_errors(p2p[there], y_corr, x_corr, verts, mass, group)
+        return error_means(errors, point_weights(y_corr, errors, x_mass, x_corr, x_mask))
 
     def _usual(self, basis_x: Basis, basis_y: Basis, xy: Tensor, yx: Tensor) -> dict[str, Tensor]:
         """Terms of one block; a pair with no function in it (a shape without symmetry has no odd one) counts as 0."""
@@ -151,21 +162,52 @@ class MatchNet(nn.Module):
         return {name: share * value for name, value in self.usual(*(v[there] for v in given)).items()} if share else {}
 
     def _truth(self, x: Item, y: Item, maps: PairMaps, soft_xy: Any) -> Tensor:
-        given: dict[str, Any]
+        given: dict[str, Tensor]
         if self.options.truth_form == "spectral":
-            given = {"fmap_even": maps.fmaps_xy[0]}
+            made = maps.fmaps_xy[0]
+            given = {"fmap_even": made}
             given |= {"evecs_even_x": maps.bases_x[0].evecs, "evecs_even_y": maps.bases_y[0].evecs}
         elif self.options.supervision == "plain":
-            given = {"soft_xy": soft_xy, "group_y": y["group"][:, :1]}
+            made, given = soft_xy, {"soft_xy": soft_xy, "group_y": y["group"][:, :1]}
         else:
-            given = {"soft_xy": soft_xy, "group_y": y["group"], "group_mask": y["group_mask"]}
-        loss: Tensor = self.truth(y["corr"], x["mass"], samples=x["corr"], truth_mask=x["corr_mask"], **given)
-        return loss
+            made, given = soft_xy, {"soft_xy": soft_xy, "group_y": y["group"], "group_mask": y["group_mask"]}
+        there = has_truth({"first": x, "second": y})
+        n_there = int(there.sum())
+        if n_there == 0:
+            # Still a function of the weights: a process whose batch has no truth must take part in the mean of the
+            # gradients, or the others would wait for it.
+            return 0.0 * made.sum()
+        points = {"p2p_xy": y["corr"], "mass_x": x["mass"], "samples": x["corr"], "truth_mask": x["corr_mask"]}
+        given |= points
+        if n_there == len(there):
+            return cast(Tensor, self.truth(**given))
+        loss: Tensor = self.truth(**{name: value[there] for name, value in given.items()})
+        return loss * (n_there / len(there))
 
     def _odd(self, feat: Tensor, item: Item, basis: Basis) -> Tensor:
         """Odd descriptors without what the odd basis does not hold, which is noise of the triangulation."""
         raw = self.odd(feat, item["faces"], item["mass"])
         return unit_mean_square(basis.evecs @ (basis.evecs_trans @ raw), item["mass"])
+
+
+def has_truth(batch: Mapping[str, Any]) -> Bool[Tensor, " B"]:
+    """Which pairs of a batch have a truth, at one point at least.
+
+    Args:
+        batch: pairs of :func:`torchqm.data.collate` with ``corr``.
+
+    Raises:
+        ValueError: it has no ``corr``.
+
+    Example:
+        >>> side = {"corr": torch.tensor([[3, 1], [0, 0]]), "corr_mask": torch.tensor([[True, False], [False, False]])}
+        >>> has_truth({"first": side, "second": side}).tolist()
+        [True, False]
+    """
+    x, y = batch["first"], batch["second"]
+    if "corr" not in x or "corr" not in y:
+        raise ValueError("corr: the pairs have none, but a supervision needs it; the data must read a truth")
+    return (x["corr_mask"] & (y["corr"] >= 0)).any(-1)
 
 
 def _whole_precision(item: Item) -> torch.autocast:

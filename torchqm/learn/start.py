@@ -1,0 +1,51 @@
+"""Begin a training with the weights of another."""
+
+from pathlib import Path
+from typing import Any
+
+from torchqm.learn.files import load_net
+from torchqm.learn.net import MatchNet
+
+__all__ = ["start_from"]
+
+_ALWAYS = ("network", "inputs", "signature", "k", "channels", "odd_pairs")
+_OWN = {"none": (), "mlp": ("width", "blocks"), "diffusion": ("width", "blocks", "gradients", "rotations")}
+
+
+def start_from(net: MatchNet, path: str | Path) -> None:
+    """Give a network the weights of a trained one.
+
+    Both must be of one architecture and read the same features; set-up, supervision and the weights of the loss may be
+    others: that is what fine-tuning is for.
+
+    Args:
+        net: its weights are replaced.
+        path: what :func:`torchqm.learn.load_net` reads: a file, the folder of a run, or ``builtin``.
+
+    Raises:
+        ValueError: there is no such file, it is damaged, or its network is another; ``net`` is as it was.
+
+    Example:
+        >>> from torchqm.learn import NetOptions
+        >>> net = MatchNet(NetOptions(setup="quotient", supervision="orbit"))
+        >>> start_from(net, "builtin")
+        >>> start_from(MatchNet(NetOptions(width=64)), "builtin")
+        Traceback (most recent call last):
+            ...
+        ValueError: start: builtin holds another architecture: width is 64 here and 128 there
+    """
+    try:
+        other = load_net(path)
+    except ValueError as error:
+        raise ValueError(f"start: {error}") from error
+    names = (*_ALWAYS, *_OWN[net.options.network])
+    here, there = ({name: _plain(getattr(some, name)) for name in names} for some in (net.options, other.options))
+    faults = [f"{name} is {here[name]} here and {there[name]} there" for name in names if here[name] != there[name]]
+    if faults:
+        raise ValueError(f"start: {path} holds another architecture: {', '.join(faults)}")
+    # In their order: with dropout, which has no weights, the layers are numbered otherwise.
+    net.load_state_dict(dict(zip(net.state_dict(), other.state_dict().values(), strict=True)))
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, list | tuple) else value
