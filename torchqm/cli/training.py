@@ -46,7 +46,6 @@ def _run(command: Callable[[Sequence[str]], Any], args: Sequence[str]) -> int:
     except SystemExit as stop:
         if stop.code != 1:  # Lightning's answer to an interrupt, after the callbacks have had their say
             raise
-        last = "checkpoints/last.ckpt"
-        print(f"torchqm: interrupted; the run folder is kept, go on with --ckpt_path RUN/{last}", file=sys.stderr)
+        print("torchqm: interrupted; the run folder RUN is kept, 'torchqm fit --resume RUN' goes on", file=sys.stderr)
         return 130
     return 0

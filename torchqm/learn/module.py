@@ -156,6 +156,14 @@ class MatchModule(LightningModule):
         """Adam."""
         return torch.optim.AdamW(self.parameters(), lr=self.hparams["lr"], weight_decay=self.hparams["weight_decay"])
 
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Options of Adam that are others than those of the checkpoint hold, which its state would undo silently."""
+        was = checkpoint.get("hyper_parameters", {})
+        changed = {name: self.hparams[name] for name in ("lr", "weight_decay") if was.get(name) != self.hparams[name]}
+        for state in checkpoint.get("optimizer_states", ()):
+            for group in state["param_groups"]:
+                group.update(changed)
+
     def _measure(self, stage: str, batch: Mapping[str, Any]) -> None:
         with self._named(batch):
             matched = self.net(batch["first"], batch["second"])
