@@ -140,7 +140,8 @@ class MatchCLI(LightningCLI):
             self._state = check_state(place.checkpoint, *fits, training=self.subcommand == "fit")
         if place.folder is not None:
             self.config[self.subcommand]["ckpt_path"] = read_config(place.folder).get("ckpt_path")
-            if self._state is not None and Path(self._state.path).parent.parent.resolve() == place.folder.resolve():
+            if self._state is not None and place.goes_on:
+                self._get(self.config_init, "checkpoint").goes_on = True
                 place = place.at(self._state.steps)
         given["ckpt_path"], given["weights_only"], self._place = place.checkpoint, True, place
         return super().instantiate_trainer(**kwargs, logger=place.loggers)
@@ -161,7 +162,7 @@ class MatchCLI(LightningCLI):
     def _tell(self, place: Place, state: TrainingState | None) -> None:
         if place.folder is None:
             text = "" if state is None else f"{state.path}: a run of its own begins from this state"
-        elif state is None:
+        elif state is None or not place.goes_on:
             text = f"{place.folder}: no epoch was finished, so that it begins anew"
         else:
             most = self.trainer.max_epochs

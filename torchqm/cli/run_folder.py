@@ -31,12 +31,17 @@ class Place:
     Args:
         checkpoint: the file that is read; None: begin with new weights.
         loggers: of the trainer, as they are configured if there is no ``folder``.
-        folder: of a run that is gone on with.
+        folder: of a run that is there already.
     """
 
     checkpoint: str | None
     loggers: Any
     folder: Path | None = None
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether the checkpoint is that of the folder: a run whose first epoch was not finished has none."""
+        return self.folder is not None and self.checkpoint == str(_last(self.folder))
 
     def at(self, steps: int) -> "Place":
         """The loggers of a run that is gone on with keep what was logged before so many steps."""
@@ -69,15 +74,14 @@ def training_place(
         UserError: a folder would get a second run, from an earlier state.
     """
     if resumed is not None:
-        last = resumed / "checkpoints" / LAST
-        found = str(last) if last.is_file() else checkpoint
+        found = str(_last(resumed)) if _last(resumed).is_file() else checkpoint
         return Place(found, _in_folder(loggers, resumed), resumed)
     run = _run_of(checkpoint)
     if checkpoint is None or run is None:
         return Place(checkpoint, loggers)
     there = _same(_folder_of(loggers), run)
     if Path(checkpoint).name == LAST and (there or (not _named(words) and same_run(run))):
-        return Place(checkpoint, _in_folder(loggers, run), run)
+        return Place(str(_last(run)), _in_folder(loggers, run), run)
     if there:
         raise UserError(
             f"{checkpoint}: not the last state of {run}, so that what came after it would be lost if it went on there; "
@@ -142,6 +146,10 @@ def _run_of(checkpoint: str | None) -> Path | None:
     if not path.is_file() or path.parent.name != "checkpoints" or not (folder / CONFIG).is_file():
         return None
     return folder if Path(checkpoint).is_absolute() else Path(os.path.relpath(folder))
+
+
+def _last(folder: Path) -> Path:
+    return folder / "checkpoints" / LAST
 
 
 def _folder_of(loggers: Any) -> Path | None:

@@ -36,21 +36,16 @@ def versions() -> dict[str, str]:
 class BestCheckpoint(ModelCheckpoint):
     """Keeps the best checkpoints by a metric, as Lightning's ``ModelCheckpoint`` does it.
 
-    A run that goes on in its own folder remembers its best checkpoints and their scores, even if the folder was moved,
-    or is named from elsewhere. A run in a new folder that starts from the state of another has none yet.
+    A run that :attr:`goes_on` in its own folder remembers its best checkpoints and their scores, even if the folder was
+    moved, or is named from elsewhere. A run in a new folder that starts from the state of another has none yet.
     """
 
-    _goes_on = False
-
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """See whether the checkpoint that is gone on from lies among those kept here."""
-        super().setup(trainer, pl_module, stage)
-        if trainer.ckpt_path is not None and self.dirpath is not None:
-            self._goes_on = Path(trainer.ckpt_path).resolve().parent == Path(self.dirpath).resolve()
+    goes_on = False
+    """Whether the state that a run begins with is that of its own folder; to be set before, since it does not say."""
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Remember, under the names that files have now."""
-        if not self._goes_on:
+        if not self.goes_on:
             return
         names = ("best_model_path", "kth_best_model_path", "last_model_path")
         paths = {name: self._here(state_dict[name]) for name in names}
