@@ -25,7 +25,7 @@ ROOT = "synthetic:kinds=ellipsoid;poses=6;verts=500;triangulation=shared"
 EPOCHS = 4
 
 CALLBACK = '''
-"""A user's own callback: a row for each step, a copy of the run folder at some moments, a stop in the midst of a step."""
+"""A user's own callback: a row for each step, copies of the run folder, a stop in the midst of an epoch."""
 import os, shutil, time
 from pathlib import Path
 from pytorch_lightning import Callback
@@ -183,3 +183,109 @@ def test_a_process_that_is_killed_in_the_midst_of_an_epoch(folder, watch, tmp_pa
     assert (run / "config.yaml").read_bytes() == text
     (run / "config.yaml").write_bytes((watch / "config.yaml").read_bytes())  # differs in save_dir alone
     assert_equal_runs(run, watch)
+
+
+def contents(run):
+    return {path: path.read_bytes() for path in run.rglob("*") if path.is_file() and "test" not in path.parts[-3:]}
+
+
+def test_a_test_changes_nothing_in_the_run_and_writes_into_a_folder_of_its_own(folder, watch, tmp_path):
+    run = tmp_path / "runs" / "version_0"
+    shutil.copytree(watch, run)
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config["trainer"]["logger"]["init_args"] |= {"save_dir": str(run.parent), "version": 0}  # given by the user
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    before = contents(run)
+    evaluate([str(run), "--trainer.max_epochs", "9"])
+    words = ["--config", str(run / "config.yaml"), "--ckpt_path", str(run / "checkpoints" / "last.ckpt")]
+    evaluate([*words, "--trainer.logger.init_args.version", "0"])  # asked for, but there is a training
+    evaluate([*words, "--trainer.logger.init_args.version", "mine"])
+    assert contents(run) == before
+    assert sorted(path.name for path in run.parent.iterdir()) == ["mine", "version_0"]
+    places = [*(run / "test" / f"version_{number}" for number in range(2)), run.parent / "mine"]
+    assert sorted((run / "test").iterdir()) == places[:2]
+    for place in places:
+        assert "test_orbit_error" in (place / "metrics.csv").read_text()
+    assert [read_config(place)["ckpt_path"].rpartition("/")[2] for place in places[:2]] == [
+        "best-epoch=0.ckpt",
+        "last.ckpt",
+    ]
+
+
+def test_options_that_are_changed_hold_and_the_earlier_ones_are_kept(folder, watch, tmp_path, capsys):
+    run = tmp_path / "version_0"
+    shutil.copytree(watch, run)
+    went = fit(["--resume", str(run), "--trainer.max_epochs=5", "--model.lr", "0.5"])
+    assert went.trainer.optimizers[0].param_groups[0]["lr"] == 0.5
+    assert went.trainer.log_dir == str(run)
+    assert f"torchqm: {run}: goes on after 4 epochs, 8 steps\n" in capsys.readouterr().err
+    assert (run / "config-1.yaml").read_bytes() == (watch / "config.yaml").read_bytes()
+    assert read_config(run)["trainer"]["max_epochs"] == 5
+    assert (run / "metrics.csv").read_text().startswith((watch / "metrics.csv").read_text())
+    fit(["--resume", str(run)])
+    assert f"{run}: goes on after 5 epochs, 10 steps; that is all it was to do" in capsys.readouterr().err
+
+
+def test_another_config_or_an_earlier_state_begins_a_run_of_its_own(folder, watch, tmp_path, monkeypatch, capsys):
+    shutil.copytree(watch, tmp_path / "runs" / "version_0")
+    monkeypatch.chdir(tmp_path)
+    run = Path("runs", "version_0")
+    before = contents(run)
+    words = ["--config", str(run / "config.yaml"), "--trainer.logger.init_args.save_dir", "runs"]
+    for file, more in (("last.ckpt", ["--data.batch_size", "2"]), ("best-epoch=0.ckpt", ["--trainer.max_epochs", "2"])):
+        went = fit([*words, "--ckpt_path", str(run / "checkpoints" / file), *more, "--trainer.max_epochs", "5"])
+        new = Path(went.trainer.log_dir)
+        assert f"{file}: a run of its own begins from this state" in capsys.readouterr().err
+        assert [Path(path).parent for path in went.config_init["fit"]["checkpoint"].best_k_models] == [
+            new / "checkpoints"
+        ]
+        assert read_config(new)["ckpt_path"] == str(run / "checkpoints" / file)
+    assert sorted(path.name for path in run.parent.iterdir()) == ["version_0", "version_1", "version_2"]
+    assert contents(run) == before
+
+
+def test_places(tmp_path):
+    run = tmp_path / "run"
+    (run / "checkpoints").mkdir(parents=True)
+    last, first = (run / "checkpoints" / name for name in ("last.ckpt", "best-epoch=0.ckpt"))
+    for path in (last, first, run / "config.yaml"):
+        path.touch()
+    own, other = (RunLogger(str(tmp_path), version=name, events=False) for name in ("run", "other"))
+
+    def train(path, logger, words=(), resumed=None, same=True):
+        return training_place(path and str(path), logger, words, resumed, lambda folder: same)
+
+    def folder_of(place):
+        return None if place.folder is None else (place.folder, place.loggers[0].log_dir)
+
+    assert folder_of(train(last, other)) == (run, str(run))
+    assert folder_of(train(None, other, resumed=run)) == (run, str(run))
+    assert folder_of(train(last, own, same=False)) == (run, str(run))  # its folder is asked for
+    for place in (train(last, other, same=False), train(last, other, ["--trainer.logger.init_args.version=other"]),
+                  train(first, other), train(None, own)):  # fmt: skip
+        assert place.folder is None
+        assert place.loggers in (own, other)
+    with pytest.raises(UserError, match=r"best-epoch=0\.ckpt: not the last state of .*run, so that what came after it"):
+        train(first, own)
+    with pytest.raises(UserError, match=r"trainer\.logger: a run goes on in its folder \(.*run\) with RunLogger"):
+        train(last, CSVLogger(str(tmp_path), None, "run"))
+    events = TensorBoardLogger(str(tmp_path), "", "run")
+    place = test_place(str(first), [events, own], [])
+    assert [logger.log_dir for logger in place.loggers] == [str(run / "test" / "version_0")]
+    assert test_place(str(first), [], []).loggers == []
+    assert test_place(None, other, []).loggers is other
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--resume"], "--resume: the folder of a run is needed"),
+        (["--resume", "--model.lr", "1"], "--resume: the folder of a run is needed"),
+        (["--resume=none"], "none: no folder of a run; config.yaml is missing"),
+        (["--resume", "a", "--ckpt_path=b"], "--resume, --ckpt_path: give one of them"),
+    ],
+)
+def test_resume_needs_a_run(words, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=message):
+        fit(words)

@@ -124,7 +124,7 @@ class MatchCLI(LightningCLI):
             UserError: a checkpoint that is not there, damaged, or of another architecture.
         """
         if self.subcommand is None:
-            return super().instantiate_trainer(**kwargs)
+            return self._trainer(**kwargs)
         given = self.config_init[self.subcommand]
         if given["weights_only"] is False:
             raise UserError(
@@ -144,7 +144,19 @@ class MatchCLI(LightningCLI):
                 self._get(self.config_init, "checkpoint").goes_on = True
                 place = place.at(self._state.steps)
         given["ckpt_path"], given["weights_only"], self._place = place.checkpoint, True, place
-        return super().instantiate_trainer(**kwargs, logger=place.loggers)
+        return self._trainer(**kwargs, logger=place.loggers)
+
+    def _trainer(self, **kwargs: Any) -> Trainer:
+        try:
+            return super().instantiate_trainer(**kwargs)
+        except RuntimeError as error:
+            if "stateful callback" not in str(error):
+                raise
+            name = str(error).split("`")[1]
+            raise UserError(
+                f"trainer.callbacks: {name} is there twice with the same options; one comes with every run, and its "
+                "options are those of 'checkpoint'"
+            ) from error
 
     def _same_run(self, folder: Path) -> bool:
         """Whether the config is that of a run folder, in all that decides what is trained."""
