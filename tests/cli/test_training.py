@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import pytorch_lightning
 import torch
 import yaml
 
@@ -14,6 +15,7 @@ from torchqm.learn import MatchModule
 
 QUICK = Path(__file__).resolve().parents[2] / "configs" / "experiment" / "quick.yaml"
 ROOT = "synthetic:kinds=ellipsoid;poses=6;verts=500;triangulation=shared"
+VERSION = {"pytorch-lightning_version": pytorch_lightning.__version__}
 SMALL = {"k": 8, "channels": 6, "width": 8, "signature": 8, "setup": "quotient"}
 
 
@@ -122,7 +124,7 @@ def test_bad_keys_values_and_roots_are_one_line(tmp_path, capsys):
 def test_checkpoints_that_cannot_be_used_are_one_line_of_fit_and_test(tmp_path, capsys):
     given = str(config(tmp_path))
     module = MatchModule(**{**SMALL, "channels": 7, "lr": 0.25})
-    content = {"state_dict": module.state_dict(), "hyper_parameters": dict(module.hparams)}
+    content = {"state_dict": module.state_dict(), "hyper_parameters": dict(module.hparams)} | VERSION
     wide, cut, foreign = (str(tmp_path / f"{name}.ckpt") for name in ("wide", "cut", "foreign"))
     torch.save(content, wide)
     Path(cut).write_bytes(Path(wide).read_bytes()[:500])
@@ -147,7 +149,8 @@ def test_checkpoints_that_cannot_be_used_are_one_line_of_fit_and_test(tmp_path, 
 def test_options_of_a_checkpoint_do_not_take_the_place_of_those_given(tmp_path):
     module = MatchModule(**SMALL, w_bij=0.5)
     path = tmp_path / "old.ckpt"
-    torch.save({"state_dict": module.state_dict(), "hyper_parameters": dict(module.hparams)}, path)
+    content = {"state_dict": module.state_dict(), "hyper_parameters": dict(module.hparams)} | VERSION
+    torch.save(content, path)
     found = evaluate(["--config", str(config(tmp_path)), "--ckpt_path", str(path), "--model.w_bij", "2"])
     assert found.model.hparams["w_bij"] == 2
     first = next(iter(module.state_dict()))

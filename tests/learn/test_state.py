@@ -40,6 +40,7 @@ def folder(tmp_path_factory):
     torch.save(whole, folder / "good.ckpt")
     torch.save(whole | {"loops": {}}, folder / "other.ckpt")
     torch.save(whole | {"hyper_parameters": {"depth": 3}}, folder / "foreign.ckpt")
+    torch.save({key: whole[key] for key in whole if "version" not in key}, folder / "bare.ckpt")
     torch.save({"a": 1}, folder / "dict.ckpt")
     torch.save(whole | {"more": Evil(folder / "evil")}, folder / "evil.ckpt")
     (folder / "raw.ckpt").write_bytes(pickle.dumps(Evil(folder / "evil")))
@@ -54,7 +55,6 @@ def test_a_checkpoint_says_how_far_its_training_has_come(folder):
     assert (found.path, found.epochs, found.steps) == (folder / "good.ckpt", 3, 12)
     # What is solved with the features, and how they are trained, may change.
     assert check(folder / "good.ckpt", setup="quotient+odd", lr=0.5, w_bij=0.0, rotations=True).steps == 12
-    check(folder / "weights.ckpt", training=False)
 
 
 @pytest.mark.parametrize(
@@ -66,6 +66,7 @@ def test_a_checkpoint_says_how_far_its_training_has_come(folder):
         ("weights.ckpt", r"weights\.ckpt: weights without the state of a training \(optimizer_states.* missing\)"),
         ("other.ckpt", r"other\.ckpt: its state of a training is not that of this version of Lightning"),
         ("foreign.ckpt", r"foreign\.ckpt: no checkpoint of torchqm\.learn\.MatchModule: its hyperparameters"),
+        ("bare.ckpt", r"bare\.ckpt: no checkpoint of Lightning \(pytorch-lightning_version missing\)"),
         ("dict.ckpt", r"dict\.ckpt: no checkpoint of torchqm\.learn\.MatchModule"),
         ("cut.ckpt", r"cut\.ckpt: damaged, cut short or no checkpoint"),
         ("empty.ckpt", r"empty\.ckpt: damaged"),
@@ -77,6 +78,12 @@ def test_what_cannot_be_used_is_named_and_nothing_is_executed(name, message, fol
     with pytest.raises(ValueError, match=message):
         check(folder / name)
     assert not (folder / "evil").exists()
+
+
+def test_a_test_needs_no_state_of_a_training(folder):
+    check(folder / "weights.ckpt", training=False)
+    with pytest.raises(ValueError, match=r"other\.ckpt: its state of a training is not that of this version"):
+        check(folder / "other.ckpt", training=False)
 
 
 def test_a_url_is_not_fetched():

@@ -16,6 +16,7 @@ _ARCHITECTURE = ("inputs", "signature", "k", "network", "channels", "width", "bl
 """Options that say what the weights mean; the others say how they are trained, and what is solved with them."""
 
 _DIFFUSION_ALONE = ("gradients", "rotations")
+_VERSION = "pytorch-lightning_version"
 _NEEDED = ("optimizer_states", "loops", "epoch", "global_step")
 
 
@@ -62,11 +63,15 @@ def check_state(
     _compare_options(path, content["hyper_parameters"], options)
     if faults := differences(weights, content["state_dict"]):
         raise ValueError(f"{path}: weights of another architecture: {faults}")
-    if not training:
-        return TrainingState(path, 0, 0)
-    if missing := [name for name in _NEEDED if name not in content]:
+    if _VERSION not in content:
+        raise ValueError(f"{path}: no checkpoint of Lightning ({_VERSION} missing)")
+    if training and (missing := [name for name in _NEEDED if name not in content]):
         raise ValueError(f"{path}: weights without the state of a training ({', '.join(missing)} missing)")
     try:
+        if not training:
+            if "loops" in content:  # weights alone have none
+                content["loops"]["test_loop"]
+            return TrainingState(path, 0, 0)
         loop = content["loops"]["fit_loop"]
         epochs = int(loop["epoch_progress"]["total"]["processed"])
         return TrainingState(path, epochs, int(loop["epoch_loop.state_dict"]["_batches_that_stepped"]))
