@@ -15,11 +15,9 @@ from pytorch_lightning.loggers import CSVLogger, TensorBoardLogger
 
 from torchqm.cli.console import UserError
 from torchqm.cli.learn import evaluate, fit
-from torchqm.cli.run_folder import read_config, test_place, training_place
+from torchqm.cli.run_folder import place_of_test, place_of_training, read_config
 from torchqm.learn.callbacks import LastEpoch
 from torchqm.learn.logger import RunLogger
-
-test_place.__test__ = False  # its name is no test's
 
 ROOT = "synthetic:kinds=ellipsoid;poses=6;verts=500;triangulation=shared"
 EPOCHS = 4
@@ -253,7 +251,7 @@ def test_places(tmp_path):
     own, other = (RunLogger(str(tmp_path), version=name, events=False) for name in ("run", "other"))
 
     def train(path, logger, words=(), resumed=None, same=True):
-        return training_place(path and str(path), logger, words, resumed, lambda folder: same)
+        return place_of_training(path and str(path), logger, words, resumed, lambda folder: same)
 
     def folder_of(place):
         return None if place.folder is None else (place.folder, place.loggers[0].log_dir)
@@ -270,10 +268,10 @@ def test_places(tmp_path):
     with pytest.raises(UserError, match=r"trainer\.logger: a run goes on in its folder \(.*run\) with RunLogger"):
         train(last, CSVLogger(str(tmp_path), None, "run"))
     events = TensorBoardLogger(str(tmp_path), "", "run")
-    place = test_place(str(first), [events, own], [])
+    place = place_of_test(str(first), [events, own], [])
     assert [logger.log_dir for logger in place.loggers] == [str(run / "test" / "version_0")]
-    assert test_place(str(first), [], []).loggers == []
-    assert test_place(None, other, []).loggers is other
+    assert place_of_test(str(first), [], []).loggers == []
+    assert place_of_test(None, other, []).loggers is other
 
 
 @pytest.mark.parametrize(

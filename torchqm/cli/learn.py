@@ -9,9 +9,10 @@ from torchqm.cli.console import UserError
 if TYPE_CHECKING:
     from pytorch_lightning.cli import LightningCLI
 
-__all__ = ["evaluate", "fit", "learn"]
+__all__ = ["CONFIG_NAME", "evaluate", "fit", "learn"]
 
 CONFIG_NAME = "config.yaml"
+"""The resolved configuration in a run folder."""
 
 
 def learn(args: Sequence[str], run: bool = True, resume: Path | None = None) -> "LightningCLI":

@@ -16,7 +16,7 @@ from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from torchqm.cli.config_errors import explained
 from torchqm.cli.console import UserError
 from torchqm.cli.inputs import shape_faults
-from torchqm.cli.run_folder import Place, RunConfig, read_config, test_place, training_place
+from torchqm.cli.run_folder import Place, RunConfig, place_of_test, place_of_training, read_config
 from torchqm.data.datamodule import PairDataModule
 from torchqm.learn.callbacks import BestCheckpoint, LastEpoch, Versions
 from torchqm.learn.faults import StepError
@@ -132,16 +132,16 @@ class MatchCLI(LightningCLI):
             )
         asked = given["ckpt_path"], given["trainer"]["logger"], self._words
         if self.subcommand == "test":
-            place = test_place(*asked)
+            place = place_of_test(*asked)
         else:
-            place = training_place(*asked, self._resumed, self._same_run)
+            place = place_of_training(*asked, self._resumed, self._same_run)
         if place.checkpoint is not None:
             fits = self.model.hparams, self.model.state_dict()
             self._state = check_state(place.checkpoint, *fits, training=self.subcommand == "fit")
         if place.folder is not None:
             self.config[self.subcommand]["ckpt_path"] = read_config(place.folder).get("ckpt_path")
+            self._get(self.config_init, "checkpoint").return_to_folder(place.goes_on)
             if self._state is not None and place.goes_on:
-                self._get(self.config_init, "checkpoint").goes_on = True
                 place = place.at(self._state.steps)
         given["ckpt_path"], given["weights_only"], self._place = place.checkpoint, True, place
         return self._trainer(**kwargs, logger=place.loggers)
@@ -202,7 +202,6 @@ class MatchCLI(LightningCLI):
                 "checkpoint.monitor": "val_orbit_error",
                 "checkpoint.filename": "best-{epoch}",
                 "checkpoint.mode": "min",
-                "checkpoint.enable_version_counter": False,  # an epoch that is computed again has its file already
             }
         )
 

@@ -12,14 +12,12 @@ from pytorch_lightning.cli import SaveConfigCallback
 from pytorch_lightning.loggers import CSVLogger, Logger, TensorBoardLogger
 
 from torchqm.cli.console import UserError
+from torchqm.cli.learn import CONFIG_NAME
 from torchqm.learn.callbacks import LAST
 from torchqm.learn.logger import RunLogger
 from torchqm.learn.run_files import write_version
 
-__all__ = ["CONFIG", "Place", "RunConfig", "read_config", "test_place", "training_place"]
-
-CONFIG = "config.yaml"
-"""The resolved configuration in a run folder."""
+__all__ = ["Place", "RunConfig", "place_of_test", "place_of_training", "read_config"]
 
 _LOGGER = "--trainer.logger"
 
@@ -50,7 +48,7 @@ class Place:
         return replace(self, loggers=_in_folder(self.loggers, self.folder, steps))
 
 
-def training_place(
+def place_of_training(
     checkpoint: str | None,
     loggers: Any,
     words: Sequence[str],
@@ -90,7 +88,7 @@ def training_place(
     return Place(checkpoint, loggers)
 
 
-def test_place(checkpoint: str | None, loggers: Any, words: Sequence[str]) -> Place:
+def place_of_test(checkpoint: str | None, loggers: Any, words: Sequence[str]) -> Place:
     """The place of a test: ``RUN/test/version_N``, unless the command line names another that has no training in it."""
     run = _run_of(checkpoint)
     if run is None or _named(words):
@@ -116,7 +114,7 @@ class RunConfig(SaveConfigCallback):
             return
         self.already_saved = True
         if trainer.is_global_zero:
-            write_version(Path(given) / CONFIG, self.parser.dump(self.config, skip_none=False))
+            write_version(Path(given) / CONFIG_NAME, self.parser.dump(self.config, skip_none=False))
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -125,9 +123,9 @@ def read_config(folder: Path) -> dict[str, Any]:
     Raises:
         UserError: there is none, or it is no YAML of keys and values.
     """
-    path = folder / CONFIG
+    path = folder / CONFIG_NAME
     if not path.is_file():
-        raise UserError(f"{folder}: no folder of a run; {CONFIG} is missing")
+        raise UserError(f"{folder}: no folder of a run; {CONFIG_NAME} is missing")
     try:
         found = yaml.safe_load(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -143,7 +141,7 @@ def _run_of(checkpoint: str | None) -> Path | None:
         return None
     path = Path(checkpoint).absolute()
     folder = path.parent.parent
-    if not path.is_file() or path.parent.name != "checkpoints" or not (folder / CONFIG).is_file():
+    if not path.is_file() or path.parent.name != "checkpoints" or not (folder / CONFIG_NAME).is_file():
         return None
     return folder if Path(checkpoint).is_absolute() else Path(os.path.relpath(folder))
 

@@ -13,7 +13,7 @@ __all__ = ["add_parser", "run_fit", "run_test"]
 def add_parser(commands: Any) -> None:
     """Add both commands; what follows them is parsed by the LightningCLI, when it is needed."""
     for name, run, text in (
-        ("fit", run_fit, "train a matcher: fit --config FILE [--model.lr 1e-3 ...]"),
+        ("fit", run_fit, "train a matcher: fit --config FILE [--model.lr 1e-3 ...], or go on: fit --resume RUN"),
         ("test", run_test, "test a trained matcher: test RUN [--data.test_root ...]"),
     ):
         # No argument begins with a NUL, so argparse takes none for an option of its own, --help included.

@@ -36,16 +36,25 @@ def versions() -> dict[str, str]:
 class BestCheckpoint(ModelCheckpoint):
     """Keeps the best checkpoints by a metric, as Lightning's ``ModelCheckpoint`` does it.
 
-    A run that :attr:`goes_on` in its own folder remembers its best checkpoints and their scores, even if the folder was
-    moved, or is named from elsewhere. A run in a new folder that starts from the state of another has none yet.
+    A run that goes on in its own folder (:meth:`return_to_folder`) remembers its best checkpoints and their scores, also
+    if the folder was moved, or is named from elsewhere. A run in a new folder that starts from the state of another
+    has none yet.
     """
 
-    goes_on = False
-    """Whether the state that a run begins with is that of its own folder; to be set before, since it does not say."""
+    _goes_on = False
+
+    def return_to_folder(self, goes_on: bool) -> None:
+        """Expect the files of a run that was stopped: those of epochs that are computed again are replaced.
+
+        Args:
+            goes_on: from a state of that run, of which the best checkpoints are remembered; a state does not say where
+                it was read from.
+        """
+        self._goes_on, self._enable_version_counter = goes_on, False
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Remember, under the names that files have now."""
-        if not self.goes_on:
+        if not self._goes_on:
             return
         names = ("best_model_path", "kth_best_model_path", "last_model_path")
         paths = {name: self._here(state_dict[name]) for name in names}
