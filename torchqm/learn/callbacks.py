@@ -36,7 +36,7 @@ def versions() -> dict[str, str]:
 class BestCheckpoint(ModelCheckpoint):
     """Keeps the best checkpoints by a metric, as Lightning's ``ModelCheckpoint`` does it.
 
-    A run that goes on in its own folder (:meth:`return_to_folder`) remembers its best checkpoints and their scores, also
+    A run that goes on in its own folder (:meth:`return_to_folder`) remembers its best checkpoints and scores, also
     if the folder was moved, or is named from elsewhere. A run in a new folder that starts from the state of another
     has none yet.
     """
