@@ -130,8 +130,10 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except UnpicklingError as error:
-        # Of a pickle with other objects, and of what is no pickle at all.
-        raise ValueError(f"{path}: damaged, or holds more than weights and is not read ({_short(error)})") from error
+        # Of a pickle with other objects, and of what is no pickle at all. What torch says is how to execute it.
+        found = re.search(r"(?:GLOBAL|global) (\w+(?:\.\w+)+)", str(error))
+        what = f" ({found[1]})" if found else ""
+        raise ValueError(f"{path}: damaged, or holds more than weights{what} and is not read") from error
     except (OSError, RuntimeError, EOFError, KeyError, ValueError) as error:
         raise ValueError(f"{path}: damaged, cut short or no checkpoint ({_short(error)})") from error
     needed = ("state_dict", "hyper_parameters")
