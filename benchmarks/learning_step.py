@@ -4,9 +4,11 @@
 
 Both take the same pairs from the same loader, start from the same weights and step with the same AdamW. One round is an
 epoch of four pairs with the one, then one with the other; a step is the time from one batch to the next, so that
-loading, logging, checks and callbacks (those of ``torchqm fit``, with its logger) are counted. The first step of an
-epoch is left out, since what is built once falls into it. Seconds are those of the clock and those of the processor in
-this process; on a machine with other work only the latter compare. Writes benchmarks/results/learning_step.json.
+loading, logging, checks and callbacks (those that ``torchqm fit`` gives every run, with its logger) are counted. Of an
+epoch the first step is left out, since what is built once falls into it, and the last, which no batch follows: what is
+done once an epoch (checkpoints, curves, pictures) is no part of a step. Seconds are those of the clock and those of the
+processor in this process; on a machine with other work only the latter compare. Writes
+benchmarks/results/learning_step.json.
 """
 
 import argparse
@@ -21,11 +23,13 @@ import torch
 from common import RESULTS, write_json
 from pytorch_lightning import Callback, Trainer
 
+from torchqm.cli.lightning import own_callbacks
 from torchqm.data.datamodule import PairDataModule
 from torchqm.learn import MatchModule
-from torchqm.learn.callbacks import LastEpoch, Versions
+from torchqm.learn.callbacks import BestCheckpoint
 from torchqm.learn.logger import RunLogger
 from torchqm.learn.options import SETUPS
+from torchqm.viz.callbacks import PairPictures
 
 BOUND_SHARE = 0.10
 
@@ -52,8 +56,9 @@ class Clock(Callback):
 
 
 def under_lightning(module: MatchModule, data: PairDataModule, folder: Path) -> Seconds:
-    """An epoch as ``torchqm fit`` has it; the checkpoint at its end is no part of a step."""
+    """Steps of an epoch as ``torchqm fit`` has it."""
     clock = Clock()
+    best = BestCheckpoint(monitor="val_orbit_error", filename="best-{epoch}")
     trainer = Trainer(
         accelerator="cpu",
         devices=1,
@@ -64,10 +69,10 @@ def under_lightning(module: MatchModule, data: PairDataModule, folder: Path) -> 
         enable_model_summary=False,
         num_sanity_val_steps=0,
         logger=RunLogger(str(folder)),
-        callbacks=[clock, Versions(), LastEpoch()],
+        callbacks=[clock, best, PairPictures(), *own_callbacks()],
     )
     trainer.fit(module, data)
-    return clock.seconds
+    return clock.seconds[1:]
 
 
 def bare(net: torch.nn.Module, data: PairDataModule, lr: float) -> Seconds:
@@ -80,7 +85,7 @@ def bare(net: torch.nn.Module, data: PairDataModule, lr: float) -> Seconds:
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    return clock.seconds
+    return clock.seconds[1:]
 
 
 def main() -> None:

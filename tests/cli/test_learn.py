@@ -81,12 +81,12 @@ def test_a_run_folder_holds_everything_and_is_tested_from_it(tmp_path, monkeypat
     assert float(row["train_loss"]) > 0
     module = MatchModule.load_from_checkpoint(folder / "checkpoints" / "last.ckpt", weights_only=True)
     assert module.hparams["channels"] == 8
-    before = (folder / "config.yaml").read_bytes()
     tested = evaluate([str(folder)])
     assert set(tested.trainer.callback_metrics) >= {"test_loss", "test_orbit_error", "test_flipped_map"}
     assert all(torch.equal(a, b) for a, b in zip(module.parameters(), tested.model.parameters(), strict=True))
-    assert (folder / "config.yaml").read_bytes() == before
-    assert yaml.safe_load((folder.with_name("version_1") / "config.yaml").read_text())["model"]["channels"] == 8
+    own = folder / "test" / "version_0"
+    assert yaml.safe_load((own / "config.yaml").read_text())["model"]["channels"] == 8
+    assert [path.name for path in folder.parent.iterdir()] == ["version_0"]
 
 
 def test_fine_tuning_is_a_training_that_begins_with_given_weights(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""The LightningCLI in more than one process."""
+"""The LightningCLI: its callbacks, its checkpoints, and more than one process."""
 
 import csv
 import os
@@ -8,7 +8,9 @@ import sys
 import pytest
 import yaml
 
-from torchqm.cli.learn import fit
+from torchqm.cli.console import UserError
+from torchqm.cli.learn import fit, learn
+from torchqm.cli.lightning import own_callbacks
 
 ROOT = "synthetic:kinds=ellipsoid;poses=4;verts=500;triangulation=shared"
 
@@ -35,6 +37,31 @@ def logged(folder):
     with (folder / "metrics.csv").open() as file:
         rows = [{key: float(cell) for key, cell in row.items() if cell} for row in csv.DictReader(file)]
     return [{key: v for row in rows if row["epoch"] == epoch for key, v in row.items()} for epoch in (0, 1)]
+
+
+def names_of(*words):
+    trainer = learn(["--data.root", "synthetic:", *words], run=False).trainer
+    return [type(callback).__name__ for callback in trainer.callbacks]
+
+
+def test_callbacks_of_a_config_are_added_to_those_of_every_run(tmp_path):
+    own = {type(callback).__name__ for callback in own_callbacks()}
+    assert own == {"LastEpoch", "Versions", "Curves"}
+    path = tmp_path / "config.yaml"
+    for given in ("pytorch_lightning.callbacks.LearningRateMonitor",
+                  [{"class_path": "pytorch_lightning.callbacks.LearningRateMonitor"}]):  # fmt: skip
+        path.write_text(yaml.safe_dump({"trainer": {"callbacks": given}}))
+        names = names_of("--config", str(path))
+        assert {"LearningRateMonitor", "BestCheckpoint", "PairPictures", "RunConfig"} | own <= set(names)
+        # What is kept of an epoch has in it what all the others made of it.
+        assert names[-1] == "LastEpoch"
+    path.write_text(yaml.safe_dump({"trainer": {"callbacks": None}}))
+    assert {"BestCheckpoint", "PairPictures", "RunConfig"} | own <= set(names_of("--config", str(path)))
+    twice = {"class_path": "torchqm.learn.callbacks.LastEpoch"}
+    assert names_of("--trainer.callbacks", str([twice]))[-1] == "LastEpoch"
+    same = {"class_path": "torchqm.learn.callbacks.BestCheckpoint", "init_args": {"monitor": "val_orbit_error"}}
+    with pytest.raises(UserError, match=r"trainer\.callbacks: BestCheckpoint is there twice with the same options"):
+        names_of("--trainer.callbacks", str([same]))
 
 
 def both(tmp_path, *more):

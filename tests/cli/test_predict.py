@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 import torch
+import yaml
 from references import shapes
 
 from torchqm.cli.main import main
@@ -81,9 +82,30 @@ def test_a_pair_that_fails_is_named_and_the_others_are_made(folder, tmp_path, ca
 def test_wrong_input_is_one_line(folder, tmp_path, capsys):
     for more, net, message in (
         ((), "no.ckpt", "no.ckpt: no such file"),
+        (("--checkpoint", "https://x.org/a.ckpt"), "no.ckpt", "https://x.org/a.ckpt: a URL"),
         (("--pairs", "some"), "net.safetensors", "no such file, and no known word"),
         (("--k-max", "3"), "net.safetensors", "k_max=3"),
     ):
         assert predict(folder, tmp_path / "out", *more, net=net) == 2
         assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_file_gives_the_options_and_what_follows_changes_them(folder, tmp_path, capsys):
+    values = {"root": str(folder / "set"), "checkpoint": str(folder / "net.safetensors"), "k_max": 60, "samples": 300}
+    values |= {"pairs": str(folder / "pairs.txt"), "out": str(tmp_path / "out"), "descriptor": None}
+    path = tmp_path / "predict.yaml"
+    path.write_text(yaml.safe_dump(values))
+    assert main(["predict", "--config", str(path), "--k-max", "40"]) == 0
+    whole = json.loads((tmp_path / "out" / "predict.json").read_text())
+    assert whole["parameters"]["k_max"] == 40
+    assert predict(folder, tmp_path / "out") == 0  # the same, in words
+    assert "2 pairs, 2 of them are there" in capsys.readouterr().out
+
+
+def test_what_is_needed_and_not_given_is_named(folder, tmp_path, capsys):
+    assert main(["predict", "--checkpoint", "builtin"]) == 2
+    assert "error: ROOT: not given, but needed\n" in capsys.readouterr().err
+    (tmp_path / "a.yaml").write_text("root: somewhere")
+    assert main(["predict", "-c", str(tmp_path / "a.yaml")]) == 2
+    assert "error: --checkpoint: not given, but needed\n" in capsys.readouterr().err

@@ -5,14 +5,17 @@ import sys
 from pathlib import Path
 
 import pytest
+import pytorch_lightning
 import torch
 import yaml
 
+from torchqm.cli.learn import evaluate
 from torchqm.cli.main import build_parser, main
 from torchqm.learn import MatchModule
 
 QUICK = Path(__file__).resolve().parents[2] / "configs" / "experiment" / "quick.yaml"
 ROOT = "synthetic:kinds=ellipsoid;poses=6;verts=500;triangulation=shared"
+VERSION = {"pytorch-lightning_version": pytorch_lightning.__version__}
 SMALL = {"k": 8, "channels": 6, "width": 8, "signature": 8, "setup": "quotient"}
 
 
@@ -118,6 +121,42 @@ def test_bad_keys_values_and_roots_are_one_line(tmp_path, capsys):
     assert error_of(capsys, "test", str(tmp_path / "empty")).startswith(f"{tmp_path / 'empty'}: no folder of a run")
 
 
+def test_checkpoints_that_cannot_be_used_are_one_line_of_fit_and_test(tmp_path, capsys):
+    given = str(config(tmp_path))
+    module = MatchModule(**{**SMALL, "channels": 7, "lr": 0.25})
+    content = {"state_dict": module.state_dict(), "hyper_parameters": dict(module.hparams)} | VERSION
+    wide, cut, foreign = (str(tmp_path / f"{name}.ckpt") for name in ("wide", "cut", "foreign"))
+    torch.save(content, wide)
+    Path(cut).write_bytes(Path(wide).read_bytes()[:500])
+    torch.save({"state_dict": {}, "hyper_parameters": {"depth": 1}}, foreign)
+    for path, text in (
+        ("none.ckpt", "none.ckpt: no such file"),
+        ("last", "last: no such file"),  # Lightning would look for one
+        (cut, f"{cut}: damaged, cut short or no checkpoint"),
+        (foreign, f"{foreign}: no checkpoint of torchqm.learn.MatchModule"),
+        (wide, f"{wide}: of another architecture: model.channels is 7 in it and 6 here"),
+        ("https://x.org/a.ckpt", "https://x.org/a.ckpt: a URL"),
+    ):
+        for command in ("fit", "test"):
+            assert error_of(capsys, command, "--config", given, "--ckpt_path", path).startswith(text)
+    assert not (tmp_path / "run").exists()
+    line = error_of(capsys, "fit", "--config", given, "--model.channels", "7", "--ckpt_path", wide)
+    assert line.startswith(f"{wide}: weights without the state of a training")
+    line = error_of(capsys, "test", "--config", given, "--ckpt_path", wide, "--weights_only", "false")
+    assert line.startswith("weights_only: false given; nothing in a checkpoint is executed")
+
+
+def test_options_of_a_checkpoint_do_not_take_the_place_of_those_given(tmp_path):
+    module = MatchModule(**SMALL, w_bij=0.5)
+    path = tmp_path / "old.ckpt"
+    content = {"state_dict": module.state_dict(), "hyper_parameters": dict(module.hparams)} | VERSION
+    torch.save(content, path)
+    found = evaluate(["--config", str(config(tmp_path)), "--ckpt_path", str(path), "--model.w_bij", "2"])
+    assert found.model.hparams["w_bij"] == 2
+    first = next(iter(module.state_dict()))
+    assert torch.equal(found.model.state_dict()[first], module.state_dict()[first])
+
+
 def test_a_run_that_cannot_go_on_names_the_pairs_keeps_the_batch_and_the_checkpoints(tmp_path, capsys, monkeypatch):
     def spoiled(self):  # what a learning rate that is too high comes to, in the second epoch
         if self.current_epoch == 1:
@@ -153,4 +192,4 @@ def test_an_interrupt_says_how_to_go_on(tmp_path, capsys, monkeypatch):
         assert main(["fit", "--config", str(config(tmp_path))]) == 130
     finally:
         signal.signal(signal.SIGINT, before)
-    assert "go on with --ckpt_path RUN/checkpoints/last.ckpt" in capsys.readouterr().err
+    assert "the run folder RUN is kept, 'torchqm fit --resume RUN' goes on" in capsys.readouterr().err

@@ -221,3 +221,17 @@ def test_numbers_that_a_layer_refuses_are_told_with_the_pairs(pairs, tmp_path):
         StepError, match=r"feat_x: .* are NaN .* at the pairs \w+-0-pose0 -> \w+-0-pose1, in step 0 of epoch 0$"
     ):
         trainer(tmp_path, 1, checkpoints=False).fit(module, *loaders(pairs))
+
+
+def test_options_of_adam_that_are_changed_hold_after_a_checkpoint_and_others_stay(whole, pairs, tmp_path):
+    module = MatchModule("quotient+odd", **{**SMALL, "lr": 0.5})
+    run = trainer(tmp_path, 3)  # all epochs are done
+    run.fit(module, *loaders(pairs), ckpt_path=whole[2] / "last.ckpt", weights_only=True)
+    (group,) = run.optimizers[0].param_groups
+    assert (group["lr"], group["weight_decay"]) == (0.5, 0.0)
+    content = torch.load(whole[2] / "last.ckpt", weights_only=True)
+    content["optimizer_states"][0]["param_groups"][0]["lr"] = 0.25  # by a callback, in the course of the run
+    torch.save(content, tmp_path / "warm.ckpt")
+    run = trainer(tmp_path, 3)
+    run.fit(MatchModule("quotient+odd", **SMALL), *loaders(pairs), ckpt_path=tmp_path / "warm.ckpt", weights_only=True)
+    assert run.optimizers[0].param_groups[0]["lr"] == 0.25

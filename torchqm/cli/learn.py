@@ -9,17 +9,19 @@ from torchqm.cli.console import UserError
 if TYPE_CHECKING:
     from pytorch_lightning.cli import LightningCLI
 
-__all__ = ["evaluate", "fit", "learn"]
+__all__ = ["CONFIG_NAME", "evaluate", "fit", "learn"]
 
 CONFIG_NAME = "config.yaml"
+"""The resolved configuration in a run folder."""
 
 
-def learn(args: Sequence[str], run: bool = True) -> "LightningCLI":
+def learn(args: Sequence[str], run: bool = True, resume: Path | None = None) -> "LightningCLI":
     """Parse ``fit --config FILE ...`` or ``test ...`` and do it.
 
     Args:
         args: what stands on the command line, the name of the subcommand first.
         run: false: parse, build everything, do nothing; then ``args`` has no subcommand.
+        resume: folder of a run that is gone on with; its config is among ``args``.
 
     Raises:
         ImportError: the extra is not installed.
@@ -29,12 +31,21 @@ def learn(args: Sequence[str], run: bool = True) -> "LightningCLI":
         from torchqm.cli.lightning import MatchCLI
     except ImportError as error:
         raise ImportError(f"learning needs the extra 'learn' (pip install 'torchqm[learn]'): {error}") from error
-    return MatchCLI.start(list(args), run)
+    return MatchCLI.start(list(args), run, resume)
 
 
 def fit(args: Sequence[str]) -> "LightningCLI":
-    """Train: ``--config FILE [--model.lr 1e-3 ...] [--ckpt_path RUN/checkpoints/last.ckpt]``."""
-    return learn(["fit", *args])
+    """Train: ``--config FILE [--model.lr 1e-3 ...]``, or go on: ``--resume RUN [--trainer.max_epochs 40 ...]``.
+
+    A run goes on in its folder, from the last whole epoch to what it would have come to without the stop.
+
+    Raises:
+        UserError: RUN is no folder of a run.
+    """
+    rest, folder = _resume(args)
+    if folder is None:
+        return learn(["fit", *args])
+    return learn(["fit", "--config", str(_config(folder)), *rest], resume=folder)
 
 
 def evaluate(args: Sequence[str]) -> "LightningCLI":
@@ -45,14 +56,33 @@ def evaluate(args: Sequence[str]) -> "LightningCLI":
     """
     if not args or args[0].startswith("-"):
         return learn(["test", *args])
-    folder = Path(args[0])
-    if not (folder / CONFIG_NAME).is_file():
-        raise UserError(f"{folder}: no folder of a run; {CONFIG_NAME} is missing")
+    config = _config(Path(args[0]))
     from torchqm.learn.files import find_weights
 
     try:
-        found = find_weights(folder)
+        found = find_weights(config.parent)
     except ValueError as error:
         raise UserError(str(error)) from error
-    own = ["--config", str(folder / CONFIG_NAME), "--ckpt_path", str(found)]
-    return learn(["test", *own, *args[1:]])
+    return learn(["test", "--config", str(config), "--ckpt_path", str(found), *args[1:]])
+
+
+def _config(folder: Path) -> Path:
+    if not (folder / CONFIG_NAME).is_file():
+        raise UserError(f"{folder}: no folder of a run; {CONFIG_NAME} is missing")
+    return folder / CONFIG_NAME
+
+
+def _resume(args: Sequence[str]) -> tuple[list[str], Path | None]:
+    """The arguments without ``--resume RUN``, and RUN."""
+    rest, folder = list(args), None
+    for number, word in enumerate(args):
+        name, equals, value = word.partition("=")
+        if name != "--resume":
+            continue
+        if not equals and (number + 1 == len(args) or args[number + 1].startswith("-")):
+            raise UserError("--resume: the folder of a run is needed")
+        folder = Path(value if equals else args[number + 1])
+        rest = [*args[:number], *args[number + (1 if equals else 2) :]]
+    if folder is not None and any(word.split("=")[0] == "--ckpt_path" for word in rest):
+        raise UserError("--resume, --ckpt_path: give one of them; a run goes on from its own last checkpoint")
+    return rest, folder

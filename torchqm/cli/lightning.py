@@ -1,53 +1,95 @@
 """The LightningCLI of torchqm: which module, which data, what a run folder holds."""
 
+import sys
 import warnings
 from argparse import ArgumentError
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
-from pytorch_lightning.callbacks import ModelCheckpoint
+import yaml
+from pytorch_lightning import Callback, Trainer
 from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
 from torchqm.cli.config_errors import explained
 from torchqm.cli.console import UserError
 from torchqm.cli.inputs import shape_faults
+from torchqm.cli.run_folder import Place, RunConfig, place_of_test, place_of_training, read_config
 from torchqm.data.datamodule import PairDataModule
-from torchqm.learn.callbacks import LastEpoch, Versions
+from torchqm.learn.callbacks import BestCheckpoint, LastEpoch, Versions
 from torchqm.learn.faults import StepError
 from torchqm.learn.module import MatchModule
 from torchqm.learn.options import NetOptions
+from torchqm.learn.state import TrainingState, check_state
 from torchqm.viz.callbacks import Curves, PairPictures
 
-__all__ = ["MatchCLI"]
+__all__ = ["MatchCLI", "own_callbacks"]
+
+_ABOUT = {
+    "fit": "Train a matcher. 'torchqm fit --resume RUN' goes on with the training in the folder RUN, with its "
+    "config.yaml; options that follow change it. --ckpt_path FILE begins a run in a new folder from the state in FILE, "
+    "but goes on in RUN where FILE is RUN/checkpoints/last.ckpt and the config is that of RUN.",
+    "test": "Test a matcher. 'torchqm test RUN' takes config.yaml and the best checkpoint (else the last) of the run "
+    "folder RUN; options that follow change it. It writes to RUN/test/version_N.",
+}
+
+
+def own_callbacks() -> list[Callback]:
+    """What every run has beside the callbacks with options of their own; those of a config are added to them."""
+    return [Versions(), LastEpoch(), Curves()]
 
 
 class MatchCLI(LightningCLI):
-    """One LightningCLI for everything that learns."""
+    """One LightningCLI for everything that learns.
+
+    What the command line says about places is decided here, before anything is written: a training that goes on does so
+    in its own folder, a test writes into a folder of its own, and a checkpoint is looked at first.
+    """
+
+    def __init__(self, *args: Any, resumed: Path | None = None, words: Sequence[str] = (), **kwargs: Any) -> None:
+        self._resumed, self._words = resumed, words
+        self._place: Place | None = None
+        self._state: TrainingState | None = None
+        super().__init__(*args, **kwargs)  # this does everything
 
     @classmethod
-    def start(cls, args: list[str], run: bool = True) -> "MatchCLI":
-        """Parse and run."""
+    def start(cls, args: list[str], run: bool = True, resume: Path | None = None) -> "MatchCLI":
+        """Parse and run; ``resume`` is the folder of a run to go on with, whose config is among the arguments."""
         # It fears that arguments are given twice; here those of the command line are what is passed on.
         warnings.filterwarnings("ignore", message="LightningCLI's args parameter")
         # The module moves its batches itself, since a truth in them is no tensor; it does so with other data, too.
         warnings.filterwarnings("ignore", message="You have overridden `transfer_batch_to_device`")
+        # Its own checkpoints, where a run goes on in its folder.
+        warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")
         once = {"exit_on_error": False}
         with shape_faults(), _stops():
             return cls(
                 MatchModule,
                 PairDataModule,
-                save_config_kwargs={"overwrite": True},
+                save_config_callback=RunConfig,
                 seed_everything_default=0,
                 args=args,
+                resumed=resume,
+                words=args,
                 run=run,
                 auto_configure_optimizers=False,
-                parser_kwargs={"prog": "torchqm", **once, **{name: dict(once) for name in cls.subcommands()}},
+                parser_kwargs={
+                    "prog": "torchqm",
+                    **once,
+                    **{name: {"description": text, **once} for name, text in _ABOUT.items()},
+                },
                 trainer_defaults={
-                    "callbacks": [Versions(), LastEpoch(), Curves()],
+                    "callbacks": own_callbacks(),
                     "logger": {"class_path": "torchqm.learn.logger.RunLogger"},
                 },
             )
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        """Those that there is a module and data for."""
+        return {name: found for name, found in LightningCLI.subcommands().items() if name in _ABOUT}
 
     def parse_arguments(self, parser: LightningArgumentParser, args: ArgsType) -> None:
         """Parse.
@@ -63,6 +105,9 @@ class MatchCLI(LightningCLI):
             keys = sorted({*known.get_defaults().keys(), *(action.dest for action in known._actions)})
             raise UserError(explained(error.message, keys, given)) from error
 
+    def _parse_ckpt_path(self) -> None:
+        """Nothing: Lightning would put the options of a checkpoint, whatever file it is, before those of the config."""
+
     def instantiate_classes(self) -> None:
         """Build everything that the config names.
 
@@ -72,12 +117,74 @@ class MatchCLI(LightningCLI):
         with _values():
             super().instantiate_classes()
 
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """Look at the checkpoint, and choose the folder.
+
+        Raises:
+            UserError: a checkpoint that is not there, damaged, or of another architecture.
+        """
+        if self.subcommand is None:
+            return self._trainer(**kwargs)
+        given = self.config_init[self.subcommand]
+        if given["weights_only"] is False:
+            raise UserError(
+                "weights_only: false given; nothing in a checkpoint is executed, so that true alone is allowed"
+            )
+        asked = given["ckpt_path"], given["trainer"]["logger"], self._words
+        if self.subcommand == "test":
+            place = place_of_test(*asked)
+        else:
+            place = place_of_training(*asked, self._resumed, self._same_run)
+        if place.checkpoint is not None:
+            fits = self.model.hparams, self.model.state_dict()
+            self._state = check_state(place.checkpoint, *fits, training=self.subcommand == "fit")
+        if place.folder is not None:
+            self.config[self.subcommand]["ckpt_path"] = read_config(place.folder).get("ckpt_path")
+            self._get(self.config_init, "checkpoint").return_to_folder(place.goes_on)
+            if self._state is not None and place.goes_on:
+                place = place.at(self._state.steps)
+        given["ckpt_path"], given["weights_only"], self._place = place.checkpoint, True, place
+        return self._trainer(**kwargs, logger=place.loggers)
+
+    def _trainer(self, **kwargs: Any) -> Trainer:
+        try:
+            return super().instantiate_trainer(**kwargs)
+        except RuntimeError as error:
+            if "stateful callback" not in str(error):
+                raise
+            name = str(error).split("`")[1]
+            raise UserError(
+                f"trainer.callbacks: {name} is there twice with the same options; one comes with every run, and its "
+                "options are those of 'checkpoint'"
+            ) from error
+
+    def _same_run(self, folder: Path) -> bool:
+        """Whether the config is that of a run folder, in all that decides what is trained."""
+        dumped = self._parser(self.subcommand).dump(self.config[str(self.subcommand)], skip_none=False)
+        ours, theirs = yaml.safe_load(dumped), read_config(folder)
+        return all(ours.get(name) == theirs.get(name) for name in ("model", "data", "seed_everything"))
+
     def before_fit(self) -> None:
         """Open the shapes and read given weights, so that a fault of the config is told from one of the code."""
         with _values():
             if self.config_init[str(self.subcommand)]["ckpt_path"] is None:
                 self.model.begin()
             self.datamodule.setup("fit")
+        if self._place is not None and self.trainer.is_global_zero:
+            self._tell(self._place, self._state)
+
+    def _tell(self, place: Place, state: TrainingState | None) -> None:
+        if place.folder is None:
+            text = "" if state is None else f"{state.path}: a run of its own begins from this state"
+        elif state is None or not place.goes_on:
+            text = f"{place.folder}: no epoch was finished, so that it begins anew"
+        else:
+            most = self.trainer.max_epochs
+            done = most is not None and 0 <= most <= state.epochs
+            more = "; that is all it was to do, more is done with --trainer.max_epochs N" if done else ""
+            text = f"{place.folder}: goes on after {state.epochs} epochs, {state.steps} steps{more}"
+        if text:
+            print(f"torchqm: {text}", file=sys.stderr)
 
     def before_test(self) -> None:
         """Likewise."""
@@ -90,7 +197,7 @@ class MatchCLI(LightningCLI):
         parser.link_arguments("seed_everything", "model.seed")
         parser.link_arguments("seed_everything", "data.seed")
         parser.link_arguments(("model.network", "model.gradients"), "data.keys", compute_fn=_keys)
-        parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
+        parser.add_lightning_class_args(BestCheckpoint, "checkpoint")
         parser.add_lightning_class_args(PairPictures, "pictures")
         parser.set_defaults(
             {

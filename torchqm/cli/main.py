@@ -28,6 +28,7 @@ first steps:
   torchqm prepare FOLDER                        eigenfunctions of all its shapes, kept for later runs
   torchqm benchmark FOLDER                      methods compared on its pairs; FOLDER may be 'synthetic:'
   torchqm fit --config FILE                     train a matcher (needs torchqm[learn])
+  torchqm fit --resume RUN                      go on with a training that was stopped
   torchqm test RUN                              test it
   torchqm match cat3.off cat0.off --checkpoint builtin
                                                 with learned descriptors
@@ -65,9 +66,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: from argparse, with status 0 for ``--help`` and 2 for arguments it does not know.
     """
-    arguments = build_parser().parse_args(argv)
-    set_threads(arguments.threads, arguments.default_threads)
     try:
+        arguments = build_parser().parse_args(argv)  # may read a file of options
+        set_threads(arguments.threads, arguments.default_threads)
         status = arguments.run(arguments)
     except UserError as error:
         print(f"torchqm: error: {' '.join(str(error).split())}", file=sys.stderr)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchqm.cli.checkpoint import CHECKPOINT_HELP, read_checkpoint
+from torchqm.cli.config_file import add_config
 from torchqm.cli.console import Progress, UserError, print_warnings
 from torchqm.cli.inputs import add_cache, add_parameters, as_plain, fit_parameters, make_parameters
 from torchqm.cli.threads import add_threads
@@ -44,8 +45,11 @@ def add_parser(commands: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("root", metavar="ROOT", help="the set of shapes, see 'torchqm data check --help'")
-    parser.add_argument("--checkpoint", required=True, metavar="RUN|FILE|builtin", help=CHECKPOINT_HELP)
+    parser.add_argument(  # a default would take the place of what a file gives
+        "root", metavar="ROOT", nargs="?", default=argparse.SUPPRESS, help="the set of shapes, see 'torchqm data check'"
+    )
+    add_config(parser)
+    parser.add_argument("--checkpoint", metavar="RUN|FILE|builtin", help=f"needed: {CHECKPOINT_HELP}")
     parser.add_argument(
         "--pairs", default="within-class", metavar="SPEC", help="see 'torchqm benchmark --help' (default %(default)s)"
     )
@@ -61,8 +65,11 @@ def run(arguments: argparse.Namespace) -> int:
     from torchqm.benchmark.ledger import file_name
     from torchqm.data import choose_pairs, open_shapes
 
+    for name, value in (("ROOT", getattr(arguments, "root", None)), ("--checkpoint", arguments.checkpoint)):
+        if value is None:
+            raise UserError(f"{name}: not given, but needed")
     parameters, descriptors = make_parameters(arguments), read_checkpoint(arguments.checkpoint)
-    assert descriptors is not None  # the option is required
+    assert descriptors is not None
     try:
         shapes = open_shapes(arguments.root)
         pairs = choose_pairs(shapes, arguments.pairs)

@@ -13,7 +13,7 @@ __all__ = ["add_parser", "run_fit", "run_test"]
 def add_parser(commands: Any) -> None:
     """Add both commands; what follows them is parsed by the LightningCLI, when it is needed."""
     for name, run, text in (
-        ("fit", run_fit, "train a matcher: fit --config FILE [--model.lr 1e-3 ...]"),
+        ("fit", run_fit, "train a matcher: fit --config FILE [--model.lr 1e-3 ...], or go on: fit --resume RUN"),
         ("test", run_test, "test a trained matcher: test RUN [--data.test_root ...]"),
     ):
         # No argument begins with a NUL, so argparse takes none for an option of its own, --help included.
@@ -46,7 +46,6 @@ def _run(command: Callable[[Sequence[str]], Any], args: Sequence[str]) -> int:
     except SystemExit as stop:
         if stop.code != 1:  # Lightning's answer to an interrupt, after the callbacks have had their say
             raise
-        last = "checkpoints/last.ckpt"
-        print(f"torchqm: interrupted; the run folder is kept, go on with --ckpt_path RUN/{last}", file=sys.stderr)
+        print("torchqm: interrupted; the run folder RUN is kept, 'torchqm fit --resume RUN' goes on", file=sys.stderr)
         return 130
     return 0

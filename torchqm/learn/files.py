@@ -17,7 +17,7 @@ from torchqm.learn.net import MatchNet
 from torchqm.learn.options import NetOptions
 from torchqm.version import __version__
 
-__all__ = ["BUILTIN", "SUFFIX", "digest", "find_weights", "load_net", "save_net"]
+__all__ = ["BUILTIN", "SUFFIX", "differences", "digest", "find_weights", "load_net", "read_checkpoint", "save_net"]
 
 BUILTIN = "builtin"
 """Names the network that ships with torchqm."""
@@ -88,10 +88,8 @@ def load_net(path: str | Path) -> MatchNet:
     # Of what the file has, not of the network: later versions may know more options.
     if written is not None and _digest(values, state) != written:
         raise ValueError(f"{path}: damaged: its weights are not those that it was written with")
-    faults = _differences(net.state_dict(), state)
-    if faults:
-        more = f" and {len(faults) - 4} more" if len(faults) > 4 else ""
-        raise ValueError(f"{path}: weights of another architecture than its options say: {'; '.join(faults[:4])}{more}")
+    if faults := differences(net.state_dict(), state):
+        raise ValueError(f"{path}: weights of another architecture than its options say: {faults}")
     # In the precision of the file before anything is copied, so that nothing is rounded.
     net.to(next((v.dtype for v in state.values() if v.is_floating_point()), torch.float32))
     net.load_state_dict(state)
@@ -106,6 +104,8 @@ def find_weights(path: str | Path) -> Path:
     """
     if str(path) == BUILTIN:
         return Path(__file__).with_name(f"builtin{SUFFIX}")
+    if "://" in str(path):
+        raise ValueError(f"{path}: a URL; a trained network is read from a file on this machine")
     path = Path(path)
     if path.is_dir():
         folder = path / "checkpoints" if (path / "checkpoints").is_dir() else path
@@ -119,6 +119,47 @@ def find_weights(path: str | Path) -> Path:
     if path.suffix not in (SUFFIX, ".ckpt"):
         raise ValueError(f"{path}: a trained network is a {SUFFIX} or a .ckpt file, or the folder of a run")
     return path
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """What a Lightning checkpoint of a :class:`torchqm.learn.MatchModule` holds; nothing in it is ever executed.
+
+    Raises:
+        ValueError: it is damaged, or something else; the file is named.
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except UnpicklingError as error:
+        # Of a pickle with other objects, and of what is no pickle at all. What torch says is how to execute it.
+        found = re.search(r"(?:GLOBAL|global) (\w+(?:\.\w+)+)", str(error))
+        what = f" ({found[1]})" if found else ""
+        raise ValueError(f"{path}: damaged, or holds more than weights{what} and is not read") from error
+    except (OSError, RuntimeError, EOFError, KeyError, ValueError) as error:
+        raise ValueError(f"{path}: damaged, cut short or no checkpoint ({_short(error)})") from error
+    needed = ("state_dict", "hyper_parameters")
+    if not isinstance(content, dict) or any(not isinstance(content.get(name), dict) for name in needed):
+        raise ValueError(f"{path}: no checkpoint of torchqm.learn.MatchModule ({' and '.join(needed)} are needed)")
+    if not {field.name for field in fields(NetOptions)} & set(content["hyper_parameters"]):
+        raise ValueError(
+            f"{path}: no checkpoint of torchqm.learn.MatchModule: its hyperparameters are those of another"
+        )
+    return content
+
+
+def differences(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor], shown: int = 4) -> str:
+    """How the names and shapes of some weights differ from others, in words; empty if they do not.
+
+    Example:
+        >>> differences({"a": torch.zeros(2), "b": torch.zeros(1)}, {"a": torch.zeros(3)})
+        'b is missing; a is (3,) instead of (2,)'
+    """
+    faults = [f"{name} is missing" for name in wanted if name not in given]
+    faults += [f"{name} is not of it" for name in given if name not in wanted]
+    for name, value in wanted.items():
+        if name in given and given[name].shape != value.shape:
+            faults.append(f"{name} is {tuple(given[name].shape)} instead of {tuple(value.shape)}")
+    more = f" and {len(faults) - shown} more" if len(faults) > shown else ""
+    return "; ".join(faults[:shown]) + more
 
 
 def digest(net: MatchNet) -> str:
@@ -159,33 +200,11 @@ def _read(path: Path) -> _Read:
 
 
 def _read_checkpoint(path: Path) -> _Read:
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except UnpicklingError as error:
-        # Of a pickle with other objects, and of what is no pickle at all.
-        raise ValueError(f"{path}: damaged, or holds more than weights and is not read ({_short(error)})") from error
-    except (OSError, RuntimeError, EOFError, KeyError, ValueError) as error:
-        raise ValueError(f"{path}: damaged, cut short or no checkpoint ({_short(error)})") from error
-    needed = ("state_dict", "hyper_parameters")
-    if not isinstance(content, dict) or any(not isinstance(content.get(name), dict) for name in needed):
-        raise ValueError(f"{path}: no checkpoint of torchqm.learn.MatchModule ({' and '.join(needed)} are needed)")
+    content = read_checkpoint(path)
     names = {field.name for field in fields(NetOptions)}
     options = {name: value for name, value in content["hyper_parameters"].items() if name in names}
-    if not options:
-        raise ValueError(
-            f"{path}: no checkpoint of torchqm.learn.MatchModule: its hyperparameters are those of another"
-        )
     state = {name: value for name, value in content["state_dict"].items() if name.startswith(_PREFIX)}
     return options, {name.removeprefix(_PREFIX): value for name, value in state.items()}, None
-
-
-def _differences(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> list[str]:
-    faults = [f"{name} is missing" for name in wanted if name not in given]
-    faults += [f"{name} is not of it" for name in given if name not in wanted]
-    for name, value in wanted.items():
-        if name in given and given[name].shape != value.shape:
-            faults.append(f"{name} is {tuple(given[name].shape)} instead of {tuple(value.shape)}")
-    return faults
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

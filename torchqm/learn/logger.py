@@ -1,5 +1,7 @@
 """The logger of a run: metrics as CSV and as events of TensorBoard, in one folder."""
 
+import csv
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,9 @@ from pytorch_lightning.loggers.logger import rank_zero_experiment
 from pytorch_lightning.utilities.rank_zero import rank_zero_only
 from torch import Tensor
 
+from torchqm.geometry.files import write_whole
+from torchqm.learn.run_files import set_aside
+
 __all__ = ["RunLogger"]
 
 
@@ -17,7 +22,7 @@ class RunLogger(CSVLogger):
     """Writes ``metrics.csv`` and, beside it, the same numbers as events that ``tensorboard --logdir`` shows.
 
     The folder is ``save_dir/name/version``; two loggers of Lightning would each count versions of their own. An earlier
-    ``metrics.csv`` there is kept as ``metrics-1.csv`` and so on.
+    ``metrics.csv`` there is kept as ``metrics-1.csv`` and so on, unless :meth:`moved` says that it is gone on with.
 
     Args:
         save_dir: where runs are kept.
@@ -39,6 +44,7 @@ class RunLogger(CSVLogger):
         events: bool = True,
     ) -> None:
         super().__init__(save_dir, name, version, flush_logs_every_n_steps=flush_logs_every_n_steps)
+        self._steps: int | None = None
         self._events: Any = None
         self._new_events: Any = None
         if events:
@@ -55,8 +61,21 @@ class RunLogger(CSVLogger):
     def experiment(self) -> Any:
         """What writes ``metrics.csv``."""
         if self._experiment is None:
-            self._experiment = _Writer(self.log_dir)
+            self._experiment = _Writer(self.log_dir, self._steps)
         return self._experiment
+
+    def moved(self, save_dir: Path, version: str | None, steps: int | None = None) -> "RunLogger":
+        """A logger with the same options for another folder.
+
+        Args:
+            save_dir: where runs are kept.
+            version: folder of the run in it; the next free ``version_N`` if not given.
+            steps: go on after so many: earlier rows are kept, later ones, which will be computed again, are dropped.
+        """
+        events = self._new_events is not None
+        other = RunLogger(str(save_dir), None, version, self._flush_logs_every_n_steps, events)
+        other._steps = steps
+        return other
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, Tensor | float], step: int | None = None) -> None:
@@ -65,7 +84,7 @@ class RunLogger(CSVLogger):
         if self._new_events is None:
             return
         if self._events is None:
-            self._events = self._new_events(self.log_dir)
+            self._events = self._new_events(self.log_dir, purge_step=self._steps)
         for key, value in metrics.items():
             self._events.add_scalar(key, float(value), step)
 
@@ -81,11 +100,38 @@ class RunLogger(CSVLogger):
 class _Writer(ExperimentWriter):
     """Keeps an earlier table instead of deleting it, and does not warn of the files that the run itself wrote."""
 
+    def __init__(self, log_dir: str, steps: int | None) -> None:
+        self._steps = steps
+        super().__init__(log_dir)
+
     def _check_log_dir_exists(self) -> None:
         path = Path(self.metrics_file_path)
         if not path.exists():
             return
-        number = 1
-        while (kept := path.with_name(f"{path.stem}-{number}{path.suffix}")).exists():
-            number += 1
-        path.rename(kept)
+        if self._steps is None:
+            set_aside(path)
+            return
+        columns, rows = _read(path)
+        self.metrics_keys = columns
+        _write(path, columns, [row for row in rows if float(row["step"]) < self._steps])
+
+    def _rewrite_with_new_header(self, fieldnames: list[str]) -> None:
+        """As Lightning does it, but a kill in the midst of it loses no row."""
+        path = Path(self.metrics_file_path)
+        _write(path, fieldnames, _read(path)[1])
+
+
+def _read(path: Path) -> tuple[list[str], list[dict[str, str]]]:
+    """Columns and whole rows; a kill may have left half of the last one."""
+    with path.open(newline="") as file:
+        reader = csv.DictReader(file)
+        rows = [row for row in reader if None not in row and None not in row.values()]
+    return list(reader.fieldnames or []), rows
+
+
+def _write(path: Path, columns: list[str], rows: list[dict[str, str]]) -> None:
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, columns)
+    writer.writeheader()
+    writer.writerows(rows)
+    write_whole(path, lambda file: file.write(text.getvalue().encode()))

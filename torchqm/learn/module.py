@@ -142,8 +142,16 @@ class MatchModule(LightningModule):
         self.begin()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """What comes from a checkpoint has begun."""
+        """What comes from a checkpoint has begun; options of Adam that are not the checkpoint's hold.
+
+        The state of the optimizer would put the old ones in their place, silently.
+        """
         self._begun = True
+        was = checkpoint.get("hyper_parameters", {})
+        changed = {name: self.hparams[name] for name in ("lr", "weight_decay") if was.get(name) != self.hparams[name]}
+        for state in checkpoint.get("optimizer_states", ()):
+            for group in state["param_groups"]:
+                group.update(changed)
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
         """The batch with its tensors on the device; a truth stays where it is, only ``corr`` is computed with."""
