@@ -78,7 +78,7 @@ def test_a_learned_weight():
     torch.testing.assert_close(layer.log_lmbda.grad.double(), (near[1] - near[0]) / 2e-4, atol=0, rtol=1e-4)
     assert layer.double()(*given)[0].dtype == torch.float64
     assert list(FunctionalMapSolver().parameters()) == []
-    with pytest.raises(ValueError, match="lmbda is 0; to be learned it must be above zero"):
+    with pytest.raises(ValueError, match="lmbda: 0 given, expected a positive number"):
         FunctionalMapSolver(0, learn_lmbda=True)
 
 
@@ -197,7 +197,3 @@ def test_every_argument_has_its_own_name():
             layer(*usual, **wrong)
     with pytest.raises(ValueError, match=r"feat_y: dtype torch\.float64 given, expected torch\.float32 as in feat_x"):
         layer(feat, feat.double(), *usual[2:])
-    with pytest.raises(ValueError, match="extra_weight is -1"):
-        FunctionalMapSolver(extra_weight=-1)
-    with pytest.raises(ValueError, match="commutativity is 'cubed'"):
-        FunctionalMapSolver(commutativity="cubed")
