@@ -195,15 +195,18 @@ def require_ids(name: str, ids: Tensor, n: int, none: bool = False) -> None:
         )
 
 
-def require_mask(name: str, mask: Tensor) -> None:
-    """Raise ``ValueError`` if a mask is not boolean or one of its rows (last dimension) has no true element."""
+def require_mask(name: str, mask: Tensor, empty: bool = False) -> None:
+    """Raise ``ValueError`` if a mask is not boolean or one of its rows (last dimension) has no true element.
+
+    With ``empty`` such a row is allowed.
+    """
     if mask.dtype != torch.bool:
         raise ValueError(f"{name}: dtype {mask.dtype} given, expected torch.bool (true: real, false: padding)")
-    if not enabled():
+    if empty or not enabled():
         return
-    empty = ~mask.any(-1)
-    if bool(empty.any()):
-        rows = empty.reshape(-1).nonzero().flatten().tolist()
+    without = ~mask.any(-1)
+    if bool(without.any()):
+        rows = without.reshape(-1).nonzero().flatten().tolist()
         raise ValueError(f"{name}: no true element in row(s) {rows[:5]}; each needs at least one")
 
 

@@ -191,6 +191,10 @@ def test_every_argument_has_its_own_name():
         ({"evals_mask_x": torch.ones(2, 3, dtype=torch.bool)}, r"evals_mask_x: shape \(2, 3\) given"),
         (odd | {"evals_odd_x": evals * torch.nan}, "evals_odd_x: 8 of 8 entries are NaN"),
         (odd | {"evecs_trans_odd_y": trans[:, :, 1:]}, r"evecs_trans_odd_y: shape \(2, 4, 5\)"),
+        (
+            odd | {"evals_odd_mask_x": torch.ones(2, 4)},
+            r"evals_odd_mask_x: dtype torch\.float32 given, expected torch\.bool",
+        ),
         (odd | {"evals_mask_x": torch.zeros(2, 4, dtype=torch.bool)}, "evals_mask_x: no true element"),
     ):
         with pytest.raises(ValueError, match=message):

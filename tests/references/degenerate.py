@@ -138,6 +138,15 @@ CALLS = {  # layer: what it reads, its call
             evals_mask_y=d["kmask"],
         ),
     ),
+    "FunctionalMapSolver.odd": (
+        ("feat", "evals", "evecs_trans", "kmask"),
+        lambda d: FunctionalMapSolver(ridge=0.1)(
+            *(d[n] for n in ("feat", "feat", "evals", "evals", "evecs_trans", "evecs_trans")),
+            **{f"evals_odd_{side}": d["evals"] for side in "xy"},
+            **{f"evecs_trans_odd_{side}": d["evecs_trans"] for side in "xy"},
+            **{f"evals_odd_mask_{side}": d["kmask"] for side in "xy"},
+        ),
+    ),
     "QuotientICP": (ICP, lambda d: QuotientICP(2, 1e-3)(*(d[n] for n in ICP))),
     "SpectralUpsampling": (
         ICP,

@@ -160,8 +160,8 @@ class FunctionalMapSolver(nn.Module):
         for name, (value, dims) in every.items():
             if value is not None:
                 sizes.bind(name, value, dims)
-                if name.startswith("evals_mask"):
-                    require_mask(name, value)
+                if "mask" in name:  # a shape without symmetry has no odd functions
+                    require_mask(name, value, empty="odd" in name)
                 elif name.startswith("evals"):
                     require_finite(name, value)
         bases_x: list[_Basis] = [(evals_x, evecs_trans_x, evals_mask_x)]
