@@ -43,11 +43,11 @@ def orthonormal(*shape, seed=0):
 
 
 def symmetric_functions():
-    """Orthonormal, three even and two odd under the flip, each kind with its share of a cluster."""
+    """Orthonormal, three even and two odd under the flip: each kind has a cluster of its own in SPECTRA."""
     even, odd = noise(V // 2, 3, seed=1), noise(V // 2, 2, seed=2)
     even, odd = torch.linalg.qr(even)[0] / 2**0.5, torch.linalg.qr(odd)[0] / 2**0.5
     even, odd = torch.cat([even, even.flip(0)]), torch.cat([odd, -odd.flip(0)])
-    return torch.cat([even[:, :2], odd[:, :1], even[:, 2:], odd[:, 1:]], 1)[None]
+    return torch.cat([even, odd], 1)[None]
 
 
 FEAT, OTHER, EVECS, MASS = (
@@ -61,13 +61,13 @@ TRANS = (EVECS * MASS[..., None]).mT
 
 
 def split_of(evals, evecs, fmaps):
-    """What does not depend on the choice of vectors in a cluster: projectors, and sums over each half's spectrum."""
+    """What does not depend on the choice of vectors in a cluster: projectors onto whole ones, sums over each half."""
     layer = SymmetrizedBasis()
     split = layer(evals, evecs, torch.ones(1, V).double(), fmaps=fmaps)
     weight = noise(V, V, seed=9)
-    halves = ((split.evecs_even, split.evals_even), (split.evecs_odd, split.evals_odd))
-    parts = [((vectors @ vectors.mT) * weight).sum() for vectors, _ in halves]
-    traces = [(values / 100).square().sum() for _, values in halves]
+    clusters = (split.evecs_even[..., :1], split.evecs_even[..., 1:], split.evecs_odd)
+    parts = [((vectors @ vectors.mT) * weight).sum() for vectors in clusters]
+    traces = [(values / 100).square().sum() for values in (split.evals_even, split.evals_odd)]
     return (
         *parts,
         *traces,
@@ -155,9 +155,17 @@ def orbit(fmap, evecs_x, evecs_y, soft, dist):
 
 
 SYMMETRIES = noise(1, 2, K, K, seed=10)
-REFLECTION = torch.diag(torch.tensor([1.0, 1, -1, 1, -1])).double()[None]
+
+
+def reflection():
+    """Exact, and mixes the first even with the first odd function, so that moving it turns vectors inside a half."""
+    turn = torch.eye(K).double()
+    turn[[0, 0, 3, 3], [0, 3, 0, 3]] = torch.tensor([0.96, -0.28, 0.28, 0.96]).double()
+    return (turn @ torch.diag(torch.tensor([1.0, 1, 1, -1, -1])).double() @ turn.T)[None]
+
+
 CASES = {  # of eigenvalues: the function and its inputs
-    "SymmetrizedBasis": lambda e: (split_of, (e, symmetric_functions(), REFLECTION + noise(1, K, K) / 50)),
+    "SymmetrizedBasis": lambda e: (split_of, (e, symmetric_functions(), reflection())),
     "WaveKernelSignature": lambda e: signature(WaveKernelSignature(3, 6), e),
     "HeatKernelSignature": lambda e: signature(HeatKernelSignature(3, 6), e),
     "InputFeatures": lambda e: (features, (e, EVECS, MASS, VERTS)),
