@@ -73,3 +73,16 @@ def test_values_are_not_looked_at_where_they_are_unknown_or_not_wanted():
         return row * 2
 
     assert torch.func.vmap(looked_at)(bad.expand(3, 1)).shape == (3, 1)
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.bool, torch.complex64])
+def test_what_is_no_real_number(dtype):
+    """Like shapes, dtypes are always checked; an empty tensor has one, too."""
+    for require in (checks.require_real, checks.require_finite, checks.require_nonnegative):
+        for tensor in (torch.ones(2, dtype=dtype), torch.ones(0, dtype=dtype)):
+            with (
+                checks.disabled(),
+                pytest.raises(ValueError, match=rf"^mass: dtype {dtype} given, expected real numbers"),
+            ):
+                require("mass", tensor)
+    checks.require_real("mass", torch.ones(2, dtype=torch.float16))

@@ -39,6 +39,17 @@ def test_other_packages_have_what_they_name(name):
     assert [n for n in getattr(module, "__all__", []) if not hasattr(module, n)] == []
 
 
+def test_the_name_of_a_class_means_one_thing():
+    """The same name in two subpackages is the same class: a result must not be taken for the layer that makes it."""
+    meanings = {}
+    for package in sorted(PACKAGES | {"torchqm"}):
+        module = importlib.import_module(package)
+        for name in getattr(module, "__all__", []):
+            if isinstance(getattr(module, name), type):
+                meanings.setdefault(name, {})[id(getattr(module, name))] = package
+    assert {name: sorted(found.values()) for name, found in meanings.items() if len(found) > 1} == {}
+
+
 def test_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         _ = torchqm.nonsense

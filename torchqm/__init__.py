@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from torchqm.matching.symmetry_file import load_symmetry as load_symmetry
     from torchqm.spectral import SpectralBasis as SpectralBasis
     from torchqm.spectral import mesh_basis as mesh_basis
-    from torchqm.symmetry import SymmetrizedBasis as SymmetrizedBasis
+    from torchqm.symmetry import EvenOddBasis as EvenOddBasis
     from torchqm.symmetry import SymmetryGroup as SymmetryGroup
     from torchqm.symmetry import even_part as even_part
     from torchqm.symmetry import odd_part as odd_part
@@ -46,12 +46,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Collection",
+    "EvenOddBasis",
     "MatchParameters",
     "MatchResult",
     "Mesh",
     "MeshError",
     "SpectralBasis",
-    "SymmetrizedBasis",
     "SymmetryGroup",
     "SymmetryResult",
     "__version__",
@@ -88,7 +88,7 @@ _HOMES = {
     ),
     "torchqm.matching.symmetry_file": ("load_symmetry",),
     "torchqm.spectral": ("SpectralBasis", "mesh_basis"),
-    "torchqm.symmetry": ("SymmetrizedBasis", "SymmetryGroup", "even_part", "odd_part", "symmetrized_basis"),
+    "torchqm.symmetry": ("EvenOddBasis", "SymmetryGroup", "even_part", "odd_part", "symmetrized_basis"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 _SUBPACKAGES = (

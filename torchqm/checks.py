@@ -19,6 +19,7 @@ __all__ = [
     "require_ids",
     "require_mask",
     "require_nonnegative",
+    "require_real",
     "set_enabled",
     "wanted",
 ]
@@ -142,8 +143,18 @@ class Sizes:
         return f"({', '.join(parts)}{',' if len(parts) == 1 else ''}){with_}"
 
 
+def require_real(name: str, tensor: Tensor) -> None:
+    """Raise ``ValueError`` if a tensor holds integers, booleans or complex numbers; always, as for shapes.
+
+    Products with integers would be cut to integers, or fail far from where they came in.
+    """
+    if not tensor.is_floating_point():
+        raise ValueError(f"{name}: dtype {tensor.dtype} given, expected real numbers (torch.float32 or torch.float64)")
+
+
 def require_finite(name: str, tensor: Tensor) -> None:
     """Raise ``ValueError`` where a tensor holds NaN or infinity; says how many and where the first is."""
+    require_real(name, tensor)
     # NaN and infinity outlive a sum, which takes a tenth of the time; if finite numbers overflow in it, look closely.
     if not enabled() or bool(torch.isfinite(tensor.detach().sum())):
         return
@@ -158,6 +169,7 @@ def require_finite(name: str, tensor: Tensor) -> None:
 
 def require_nonnegative(name: str, tensor: Tensor) -> None:
     """Raise ``ValueError`` where a tensor has a negative or non-finite entry."""
+    require_real(name, tensor)
     if not enabled():
         return
     require_finite(name, tensor)
@@ -183,15 +195,18 @@ def require_ids(name: str, ids: Tensor, n: int, none: bool = False) -> None:
         )
 
 
-def require_mask(name: str, mask: Tensor) -> None:
-    """Raise ``ValueError`` if a mask is not boolean or one of its rows (last dimension) has no true element."""
+def require_mask(name: str, mask: Tensor, empty: bool = False) -> None:
+    """Raise ``ValueError`` if a mask is not boolean or one of its rows (last dimension) has no true element.
+
+    With ``empty`` such a row is allowed.
+    """
     if mask.dtype != torch.bool:
         raise ValueError(f"{name}: dtype {mask.dtype} given, expected torch.bool (true: real, false: padding)")
-    if not enabled():
+    if empty or not enabled():
         return
-    empty = ~mask.any(-1)
-    if bool(empty.any()):
-        rows = empty.reshape(-1).nonzero().flatten().tolist()
+    without = ~mask.any(-1)
+    if bool(without.any()):
+        rows = without.reshape(-1).nonzero().flatten().tolist()
         raise ValueError(f"{name}: no true element in row(s) {rows[:5]}; each needs at least one")
 
 

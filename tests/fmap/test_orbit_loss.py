@@ -354,7 +354,7 @@ PI, TABLE, TRUTH = torch.full((2, 3), 1 / 3), torch.tensor([[0, 1, 2], [2, 1, 0]
             {"p2p_xy": torch.tensor([0])},
             r"p2p_xy: shape \(1,\) given, expected \(X,\) with X = 2",
         ),
-        (assignment_orbit_loss, {"eps": 0.0}, "eps: 0.0 given, expected a number between 0 and 1"),
+        (assignment_orbit_loss, {"eps": 0.0}, "eps: 0.0 given, expected a positive number below 1"),
         (
             assignment_orbit_loss,
             {"samples": torch.tensor([0, 2])},
@@ -370,7 +370,13 @@ PI, TABLE, TRUTH = torch.full((2, 3), 1 / 3), torch.tensor([[0, 1, 2], [2, 1, 0]
         ),
         (distance_orbit_loss, {}, "dist_y, orbit_dist: exactly one of them must be given"),
         (distance_orbit_loss, {"dist_y": torch.ones(3, 3), "group_y": None}, "group_y: must be given with dist_y"),
-        (distance_orbit_loss, {"orbit_dist": torch.ones(3, 3)}, r"orbit_dist: shape \(3, 3\) given"),
+        (distance_orbit_loss, {"orbit_dist": torch.ones(3, 3), "group_y": None}, r"orbit_dist: shape \(3, 3\) given"),
+        (distance_orbit_loss, {"orbit_dist": torch.ones(2, 3)}, "group_y: given with orbit_dist, which holds"),
+        (
+            distance_orbit_loss,
+            {"orbit_dist": torch.ones(2, 3), "group_y": None, "group_mask": torch.ones(2, dtype=torch.bool)},
+            "group_mask: given with orbit_dist, which holds",
+        ),
         (map_orbit_loss, {"temperature": -1.0}, "temperature: -1.0 given"),
         (map_orbit_loss, {"dist_y": torch.ones(3, 3), "log_weights": True}, "log_weights: distances need the weights"),
         (map_orbit_loss, {"p2p_xy": torch.tensor([-1, -1])}, "p2p_xy: no point of shape 0 has both a truth"),

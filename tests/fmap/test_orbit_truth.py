@@ -74,8 +74,10 @@ def test_bad_tables():
         unchecked(orbit_members)(truth, table, torch.ones(3, dtype=torch.bool))
     with pytest.raises(ValueError, match=r"group_y: dtype torch\.float32 given, expected vertex ids"):
         unchecked(orbit_members)(truth, table.float())
-    with pytest.raises(ValueError, match=r"temperature: -1.0 given, expected 0 or a number from 1e-30 on"):
+    with pytest.raises(ValueError, match=r"temperature: -1\.0 given, expected a number from 0 on"):
         soft_minimum(torch.ones(2), -1.0)
+    with pytest.raises(ValueError, match="temperature: 1e-31 given, expected 0 or a number from 1e-30 on"):
+        soft_minimum(torch.ones(2), 1e-31)
 
 
 def test_bad_points():

@@ -244,6 +244,49 @@ def test_gradients_of_blocks():
     assert gradcheck64(solve, *even, *odd)
 
 
+def few_descriptors(scale, c, k=50, dtype=torch.float32):
+    """Nearly isometric spectra and random descriptors, their coefficients of size ``scale``, given in float32."""
+    g = torch.Generator().manual_seed(c)
+    a = scale * torch.randn(1, k, c, generator=g)
+    truth = torch.linalg.qr(torch.eye(k) + 0.05 * torch.randn(1, k, k, generator=g))[0]
+    x = (12.57 * (torch.arange(k) + 0.3 * torch.rand(1, k, generator=g))).sort(-1).values
+    y = (x * (1 + 0.003 * torch.randn(1, k, generator=g))).sort(-1).values
+    return [tensor.to(dtype) for tensor in (a, truth @ a, x, y)]
+
+
+def row_errors(found, exact):
+    return (found - exact).norm(dim=-1) / exact.norm(dim=-1)
+
+
+@pytest.mark.parametrize("c", [3, 10, 30, 49])
+def test_few_descriptors_in_single_precision(c):
+    """Less than functions, at the scale of functions on a shape of area 1: commutativity makes up for them."""
+    exact = regularized_fmap(*few_descriptors(1.0, c, dtype=torch.float64))
+    assert float(row_errors(regularized_fmap(*few_descriptors(1.0, c)), exact).max()) < 1e-3
+
+
+@pytest.mark.parametrize("c", [3, 10, 30])
+def test_what_single_precision_refuses_is_noise(c):
+    """A hundred times as large: of the rows that are refused rounding leaves two digits at best; a ridge helps."""
+    given = few_descriptors(100.0, c)
+    with pytest.raises(UndeterminedRowsError) as raised:
+        regularized_fmap(*given)
+    refused = raised.value.undetermined
+    exact = regularized_fmap(*few_descriptors(100.0, c, dtype=torch.float64))
+    # As ULRSSM does it, an inverse a row: what it would have returned.
+    a, b, x, y = given
+    systems = (a @ a.mT)[:, None] + torch.diag_embed(100 * commutativity_mask(x, y))
+    inverted = (torch.linalg.inv(systems) @ (b @ a.mT)[..., None])[..., 0]
+    errors = row_errors(inverted, exact)[refused]
+    assert float(errors.median()) > 1e-2
+    assert float((errors > 1e-3).float().mean()) > 0.99
+    ridge = {"ridge": 1e-3}
+    helped = row_errors(regularized_fmap(*given, **ridge), regularized_fmap(*(t.double() for t in given), **ridge))
+    assert float(helped.max()) < 1e-2
+    with pytest.raises(UndeterminedRowsError):
+        regularized_fmap(*given, ridge=1e-7)  # below the precision
+
+
 def test_under_vmap():
     a, b, x, y = problem(3)
     torch.testing.assert_close(torch.func.vmap(regularized_fmap)(a, b, x, y), regularized_fmap(a, b, x, y))

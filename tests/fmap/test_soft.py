@@ -189,3 +189,25 @@ def test_bad_input(change, message):
     given = {"feat_x": torch.ones(6, 4), "feat_y": torch.ones(8, 4), "tau": 0.5} | change
     with pytest.raises(ValueError, match=message):
         unchecked(soft_map)(**given)
+
+
+@pytest.mark.parametrize("kind", ["dot", "distance"])
+def test_a_sparse_map_of_each_sample(kind):
+    """Under vmap, alone and inside a gradient, as called with the whole batch."""
+    x, y = noise(3, 5, 4), noise(3, 6, 4, seed=1)
+    mask = torch.arange(6) < torch.tensor([[6], [4], [5]])
+
+    def one(x, y, mask):
+        return soft_map(x, y, 0.5, 3, mask_y=mask, kind=kind)
+
+    found, whole = torch.func.vmap(one)(x, y, mask), soft_map(x, y, 0.5, 3, mask_y=mask, kind=kind)
+    assert torch.equal(found.indices, whole.indices)
+    torch.testing.assert_close(found.weights, whole.weights)
+    weight = noise(5, 6, seed=2)
+    grad = torch.func.vmap(torch.func.grad(lambda *given: (one(*given).to_dense() * weight).sum(), (0, 1)))(x, y, mask)
+    tracked = x.clone().requires_grad_(), y.clone().requires_grad_()
+    expected = torch.autograd.grad(
+        (soft_map(*tracked, 0.5, 3, mask_y=mask, kind=kind).to_dense() * weight).sum(), tracked
+    )
+    for ours, wanted in zip(grad, expected, strict=True):
+        torch.testing.assert_close(ours, wanted)

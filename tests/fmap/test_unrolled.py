@@ -44,8 +44,8 @@ def test_cold_is_upsampling(pair):
 
 def test_a_batch_is_each_alone_and_padding_stays_empty(pair):
     x, y = pair
-    first = soft_icp(blurred(8), x.evecs[:60, :8], y.evecs[:, :8], 2, weights_x=x.mass[:60])
-    second = soft_icp(blurred(6, 1), x.evecs[:90, :6], y.evecs[:500, :6], 2, weights_x=x.mass[:90])
+    first = soft_icp(blurred(8), x.evecs[:60, :8], y.evecs[:, :8], 2, mass_x=x.mass[:60])
+    second = soft_icp(blurred(6, 1), x.evecs[:90, :6], y.evecs[:500, :6], 2, mass_x=x.mass[:90])
     pad = torch.nn.functional.pad
     n = y.n_verts
     masks = torch.arange(8) < torch.tensor([[8], [6]])
@@ -54,7 +54,7 @@ def test_a_batch_is_each_alone_and_padding_stays_empty(pair):
         torch.stack([pad(x.evecs[:60, :8], (0, 0, 0, 30)), pad(x.evecs[:90, :6], (0, 2))]),
         torch.stack([y.evecs[:, :8], pad(y.evecs[:500, :6], (0, 2, 0, n - 500))]),
         2,
-        weights_x=torch.stack([pad(x.mass[:60], (0, 30)), x.mass[:90]]),
+        mass_x=torch.stack([pad(x.mass[:60], (0, 30)), x.mass[:90]]),
         verts_mask_y=torch.arange(n) < torch.tensor([[n], [500]]),
         evals_mask_x=masks,
         evals_mask_y=masks,
@@ -63,6 +63,77 @@ def test_a_batch_is_each_alone_and_padding_stays_empty(pair):
     torch.testing.assert_close(both[1, :6, :6], second)
     assert not both[1, 6:].any()
     assert not both[1, :, 6:].any()
+
+
+@pytest.mark.parametrize("neighbours", [None, 4])
+def test_upsampling_of_unequal_numbers_of_functions_is_each_alone(pair, neighbours):
+    """Padding holds anything finite, on the functions, the vertices and the map; gradients do not reach it."""
+    x, y = pair
+    counts_x, counts_y, points_x, points_y = (20, 9, 6), (20, 12, 5), (60, 90, 80), (642, 300, 500)
+    start, sizes = 8, [10, 16, 20]
+    alone, batch = [], {name: [] for name in ("fmap", "x", "y", "mass")}
+    for i, (kx, ky, nx, ny) in enumerate(zip(counts_x, counts_y, points_x, points_y, strict=True)):
+        fmap = blurred(start, i)[:ky, :kx]
+        given = fmap, x.evecs[:nx, :kx], y.evecs[:ny, :ky]
+        grown = None
+        # Alone a shape has no functions beyond its own: sizes end there, on each side.
+        for size in sizes:
+            grown = rectangular(
+                fmap if grown is None else grown, *given[1:], min(size, ky), min(size, kx), neighbours, x.mass[:nx]
+            )
+        alone.append(grown)
+        for name, value, shape in (
+            ("fmap", fmap, (start, start)),
+            ("x", given[1], (90, 20)),
+            ("y", given[2], (642, 20)),
+            ("mass", x.mass[:nx], (90,)),
+        ):
+            padded = torch.full(shape, 0.0 if name == "mass" else 3.0, dtype=torch.float64)
+            padded[tuple(slice(n) for n in value.shape)] = value
+            batch[name].append(padded)
+    fmaps, at_x, at_y, mass = (torch.stack(batch[name]) for name in ("fmap", "x", "y", "mass"))
+    at_x[..., 60:, :][0] = at_x[2, 80:] = 0.0  # padded vertices are told by their area of 0 and by the mask of y
+    fmaps, at_x, at_y = (tensor.requires_grad_() for tensor in (fmaps, at_x, at_y))
+    found = soft_upsample(
+        *(fmaps, at_x, at_y, sizes, 1, 0.05, neighbours, mass),
+        torch.arange(642) < torch.tensor(points_y)[:, None],
+        torch.arange(20) < torch.tensor(counts_x)[:, None],
+        torch.arange(20) < torch.tensor(counts_y)[:, None],
+    )
+    for i, (kx, ky) in enumerate(zip(counts_x, counts_y, strict=True)):
+        torch.testing.assert_close(found[i, :ky, :kx], alone[i], atol=1e-9, rtol=0)
+        assert not found[i, ky:].any()
+        assert not found[i, :, kx:].any()
+    grads = torch.autograd.grad(found.square().mul(torch.arange(20)).sum(), (fmaps, at_x, at_y))
+    assert all(bool(torch.isfinite(grad).all()) for grad in grads)
+    assert not grads[0][2, 5:].any()
+    assert not grads[1][1, :, 9:].any()
+    assert not grads[2][1, :, 12:].any()
+
+
+def rectangular(fmap, at_x, at_y, size_y, size_x, neighbours, mass):
+    """One step from a map of any size to another, written with dense matrices."""
+    ky, kx = fmap.shape
+    gaps = torch.cdist(at_x[:, :kx] @ fmap.T, at_y[:, :ky]).square() / ky
+    if neighbours is not None:
+        gaps = gaps.masked_fill(gaps > gaps.sort(1).values[:, neighbours - 1, None], torch.inf)
+    partners = torch.softmax(-gaps / 0.05, 1) @ at_y[:, :size_y]
+    left, _, right = torch.linalg.svd(partners.T @ (mass[:, None] * at_x[:, :size_x]), full_matrices=False)
+    return left @ right
+
+
+def test_masks_of_functions_are_checked(pair):
+    x, y = pair
+    none = torch.arange(20) >= 9
+    grow = unchecked(soft_upsample)
+    with pytest.raises(ValueError, match=r"evals_mask_x\[\.\.\., :8\]: no true element"):
+        grow(blurred(8), x.evecs, y.evecs, [10, 20], evals_mask_x=none)
+    with pytest.raises(
+        ValueError, match=r"evals_mask_y: shape \(8,\) given, expected \(K,\) with K = 20 as in evecs_y"
+    ):
+        grow(blurred(8), x.evecs, y.evecs, [10, 20], evals_mask_y=none[:8])
+    with pytest.raises(TypeError, match=r"sizes\[0\]: 9.5 \(float\) given"):
+        grow(blurred(8), x.evecs, y.evecs, [9.5])
 
 
 @pytest.mark.parametrize("neighbours", [None, 3])
@@ -93,17 +164,17 @@ def test_bad_input_is_named(pair):
     icp, grow = unchecked(soft_icp), unchecked(soft_upsample)
     with pytest.raises(ValueError, match=r"evecs_x: shape \(642, 9\) given, .* Kx = 8 as in fmap_xy"):
         icp(start, x.evecs[:, :9], at_y)
-    with pytest.raises(ValueError, match="tau=0: the temperature must be positive"):
+    with pytest.raises(ValueError, match="tau: 0 given, expected a positive number"):
         icp(start, at_x, at_y, tau=0)
-    with pytest.raises(ValueError, match="neighbours=700: of 642 vertices"):
+    with pytest.raises(ValueError, match=r"neighbours: 700 given, but y has 642 vertices, so 1\.\.642 is allowed"):
         icp(start, at_x, at_y, neighbours=700)
-    with pytest.raises(ValueError, match="weights_x: 642 of 642 entries are negative"):
-        icp(start, at_x, at_y, weights_x=-x.mass)
-    with pytest.raises(ValueError, match="weights_x > 0: no true element"):
-        icp(start, at_x, at_y, weights_x=0 * x.mass)
+    with pytest.raises(ValueError, match="mass_x: 642 of 642 entries are negative"):
+        icp(start, at_x, at_y, mass_x=-x.mass)
+    with pytest.raises(ValueError, match="mass_x > 0: no true element"):
+        icp(start, at_x, at_y, mass_x=0 * x.mass)
     with pytest.raises(ValueError, match=r"evals_mask_x: dtype torch\.float64 given"):
         icp(start, at_x, at_y, evals_mask_x=torch.ones(8, dtype=torch.float64))
-    with pytest.raises(ValueError, match="steps=-1"):
+    with pytest.raises(ValueError, match="steps: -1 given, expected a whole number from 0 on"):
         icp(start, at_x, at_y, -1)
     with pytest.raises(ValueError, match="fmap_xy: 64 of 64 entries are NaN"):
         icp(start * torch.nan, at_x, at_y)

@@ -111,13 +111,13 @@ def test_bad_input_is_named(basis, make):
 
 
 def test_bad_options_are_named():
-    with pytest.raises(ValueError, match="n=1, k=128"):
+    with pytest.raises(ValueError, match="n: 1 given, expected a whole number from 2 on"):
         WaveKernelSignature(n=1)
-    with pytest.raises(ValueError, match="n=4, k=2"):
+    with pytest.raises(ValueError, match="k: 2 given, expected a whole number from 3 on"):
         HeatKernelSignature(n=4, k=2)
-    with pytest.raises(ValueError, match=r"n_pairs=4: 3 features make 1\.\.3 pairs"):
+    with pytest.raises(ValueError, match=r"n_pairs: 4 given, but 3 features make 1\.\.3 pairs"):
         OrientationDescriptors(3, 4)
-    with pytest.raises(ValueError, match="n_features=1"):
+    with pytest.raises(ValueError, match="n_features: 1 given"):
         OrientationDescriptors(1)
     with pytest.raises(ValueError, match="times: 1 of 1 entries are negative"):
         HeatKernelSignature(times=torch.tensor([-1.0]))

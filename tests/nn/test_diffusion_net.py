@@ -223,10 +223,10 @@ def test_bad_input_is_named(item):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"outputs_at": "faces"}, "outputs_at='faces': supported are vertices, global_mean"),
-        ({"diffusion_method": "implicit_dense"}, "diffusion_method='implicit_dense': supported is spectral"),
-        ({"dropout": 1.0}, "dropout=1.0"),
-        ({"N_block": 0}, "N_block=0: all must be at least 1"),
+        ({"outputs_at": "faces"}, "outputs_at: 'faces' given, allowed are vertices, global_mean"),
+        ({"diffusion_method": "implicit_dense"}, "diffusion_method: 'implicit_dense' given, allowed are spectral"),
+        ({"dropout": 1.0}, "dropout: 1.0 given, expected a number from 0 below 1"),
+        ({"N_block": 0}, "N_block: 0 given, expected a whole number from 1 on"),
     ],
 )
 def test_bad_options_are_named(options, message):

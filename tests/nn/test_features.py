@@ -114,7 +114,7 @@ def test_network_of_points_with_a_mask_and_dropout():
 
 
 def test_bad_input_of_the_network_is_named():
-    with pytest.raises(ValueError, match=r"c_in=4, c_out=3, hidden=\(0,\): all must be at least 1"):
+    with pytest.raises(ValueError, match=r"hidden\[0\]: 0 given, expected a whole number from 1 on"):
         MLP(4, 3, (0,))
     net = MLP(4, 3)
     call = partial(unchecked(MLP.forward), net)

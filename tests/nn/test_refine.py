@@ -33,12 +33,11 @@ def test_the_temperature_is_learned(make):
     assert "tau=0.3" in repr(layer)
 
 
-def test_bad_options_are_named():
-    with pytest.raises(ValueError, match=r"tau=0\.0"):
-        QuotientICP(tau=0.0)
-    with pytest.raises(ValueError, match="steps=-1"):
-        QuotientICP(steps=-1)
-    with pytest.raises(ValueError, match="neighbours=0"):
-        QuotientICP(neighbours=0)
-    with pytest.raises(ValueError, match="steps=0"):
-        SpectralUpsampling((4,), steps=0)
+def test_shapes_of_a_batch_may_have_different_numbers_of_functions():
+    fmap, x, y, mass = inputs()
+    masks = torch.arange(6) < torch.tensor([[6], [5]]), torch.arange(6) < torch.tensor([[4], [6]])
+    layer = SpectralUpsampling((5, 6), 2, 0.5)
+    found = layer(fmap, x, y, mass, evals_mask_x=masks[0], evals_mask_y=masks[1])
+    torch.testing.assert_close(found, soft_upsample(fmap, x, y, (5, 6), 2, 0.5, None, mass, None, *masks))
+    assert not found[0, 4:].any()
+    assert not found[1, :, 5:].any()

@@ -69,9 +69,11 @@ def test_a_learned_temperature(k, dtype):
 
 
 def test_bad_options():
-    with pytest.raises(ValueError, match=r"tau: 0.0 given, expected a positive number"):
-        SoftPointMap(0.0)
-    with pytest.raises(ValueError, match=r"tau: -1 given, expected a positive number"):
-        Similarity(tau=-1.0)(torch.zeros(2))
+    with pytest.raises(ValueError, match="chunk: 5 given, but only of use together with k"):
+        SoftPointMap(chunk=5)
+    with pytest.raises(ValueError, match="dim: 2 given, but log_alpha has 2 dimensions"):
+        Similarity(normalise_dim=2)(torch.zeros(2, 2))
+    with pytest.raises(ValueError, match=r"log_alpha: shape \(2, 0\) given, expected entries along dimension -1"):
+        Similarity()(torch.zeros(2, 0))
     with pytest.raises(ValueError, match="log_alpha: 1 of 2 entries are NaN"):
         Similarity()(torch.tensor([0.0, torch.nan]))

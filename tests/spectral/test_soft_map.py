@@ -43,3 +43,21 @@ def test_gradients():
 def test_values_of_another_shape():
     with pytest.raises(ValueError, match="values: 8 rows given, but the map goes to 9 vertices"):
         random_map(torch.Generator()).apply(torch.zeros(8, 2, dtype=torch.float64))
+
+
+def test_mapped_over_samples():
+    """A sparse map goes in and comes out of vmap, and is a tree of two tensors."""
+    generator = torch.Generator().manual_seed(2)
+    soft = random_map(generator, 3)
+    values = torch.rand(3, 9, 4, generator=generator, dtype=torch.float64)
+    found = torch.func.vmap(lambda one, f: one.apply(f))(soft, values)
+    torch.testing.assert_close(found, soft.apply(values))
+    halved = torch.func.vmap(lambda one: SoftMap(one.indices, one.weights / 2, one.n_targets))(soft)
+    assert halved.n_targets == 9
+    assert torch.equal(halved.to_dense(), soft.to_dense() / 2)
+    one = torch.func.vmap(lambda f, only: only.apply(f), in_dims=(0, None))(values, random_map(generator))
+    assert one.shape == (3, soft.indices.shape[1], 4)
+    leaves, spec = torch.utils._pytree.tree_flatten(soft)
+    assert all(a is b for a, b in zip(leaves, (soft.indices, soft.weights), strict=True))
+    assert torch.utils._pytree.tree_unflatten(leaves, spec).n_targets == 9
+    assert torch.utils._pytree.treespec_loads(torch.utils._pytree.treespec_dumps(spec)) == spec

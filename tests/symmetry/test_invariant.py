@@ -211,3 +211,10 @@ def test_single_precision():
     (exact.trace() + spectral_projector(-exact, -2.0)[0, 1]).backward()
     assert values.dtype == vectors.dtype == matrix.grad.dtype == torch.float32
     torch.testing.assert_close(matrix.grad.double(), exact.grad, atol=1e-5, rtol=0)
+
+
+def test_a_negative_tolerance_is_refused():
+    """With one, an eigenvalue would have a gap to itself, and the gradient be infinite."""
+    for function in (invariant_eigh, split_eigh, spectral_projector):
+        with pytest.raises(ValueError, match=r"rtol: -0\.1 given, expected a number from 0 on"):
+            function(torch.eye(2), rtol=-0.1)

@@ -354,3 +354,16 @@ def test_the_trivial_group_changes_nothing():
     split = symmetrized_bases(basis.evals, basis.evecs, basis.mass, group=group)
     torch.testing.assert_close(split.evecs_even, basis.evecs, atol=1e-10, rtol=0)  # the signs, too
     assert split.evecs_odd.shape == (642, 0)
+
+
+def test_no_shape_and_no_function():
+    evals, evecs, mass = torch.zeros(0, 3), torch.zeros(0, 5, 3), torch.ones(0, 5)
+    split = symmetrized_bases(evals, evecs, mass, fmaps=torch.zeros(0, 3, 3))
+    assert split.evecs_even.shape == split.evecs_odd.shape == (0, 5, 0)
+    assert symmetrized_bases(evals, evecs, mass, fmaps=torch.zeros(0, 3, 3), k_even=2).evecs_even.shape == (0, 5, 2)
+    with pytest.raises(ValueError, match=r"evecs: shape \(5, 0\) given, expected at least one function"):
+        symmetrized_bases(torch.zeros(0), torch.zeros(5, 0), torch.ones(5), fmaps=torch.zeros(0, 0))
+    with pytest.raises(ValueError, match=r"projection: shape \(0, 0\) given, expected at least one function"):
+        symmetrized_projector(torch.zeros(0, 0))
+    with pytest.raises(ValueError, match=r"mass > 0: no true element in row\(s\) \[0\]"):
+        symmetrized_bases(torch.zeros(3), torch.eye(5)[:, :3], torch.zeros(5), fmaps=torch.eye(3))

@@ -1,5 +1,7 @@
 """Losses of pairs of functional maps without truth: bijectivity, orthogonality, commutativity (SURFMNet)."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -47,6 +49,7 @@ def surfmnet_losses(
     evals_y: Float[Tensor, "*B Ky"],
     mask_x: Bool[Tensor, "*B Kx"] | None = None,
     mask_y: Bool[Tensor, "*B Ky"] | None = None,
+    names: Sequence[str] = ("fmap_xy", "fmap_yx", "evals_x", "evals_y", "mask_x", "mask_y"),
 ) -> dict[str, Float[Tensor, "*B"]]:
     """The bijectivity, orthogonality and commutativity energies of two maps, unweighted, for each pair.
 
@@ -61,6 +64,7 @@ def surfmnet_losses(
         evals_y: ``(..., Ky)`` eigenvalues of y.
         mask_x: ``(..., Kx)`` real functions of x; what the maps hold at others is left out.
         mask_y: ``(..., Ky)`` real functions of y.
+        names: what the six are called in messages.
 
     Returns:
         ``l_bij``, ``l_orth`` and ``l_lap``, each ``(...)``.
@@ -77,11 +81,11 @@ def surfmnet_losses(
         Roufosse, Sharma and Ovsjanikov, Unsupervised deep learning for structured shape matching, ICCV 2019.
     """
     sizes = Sizes()
-    given = {"fmap_xy": fmap_xy, "fmap_yx": fmap_yx, "evals_x": evals_x, "evals_y": evals_y}
-    for (name, value), dims in zip(given.items(), ("... Ky Kx", "... Kx Ky", "... Kx", "... Ky"), strict=True):
+    given = ((fmap_xy, "... Ky Kx"), (fmap_yx, "... Kx Ky"), (evals_x, "... Kx"), (evals_y, "... Ky"))
+    for name, (value, dims) in zip(names[:4], given, strict=True):
         sizes.bind(name, value, dims)
         require_finite(name, value)
-    for name, mask, dims in (("mask_x", mask_x, "... Kx"), ("mask_y", mask_y, "... Ky")):
+    for name, mask, dims in zip(names[4:], (mask_x, mask_y), ("... Kx", "... Ky"), strict=True):
         if mask is not None:
             sizes.bind(name, mask, dims)
             require_mask(name, mask)

@@ -1,5 +1,7 @@
 """Orbit consistency: a map must carry the symmetries of one shape to those of the other. No truth is needed."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -43,6 +45,7 @@ def orbit_consistency_fmap(
     group_mask: Bool[Tensor, "*B G"] | None = None,
     pairings: Int[Tensor, "A G"] | None = None,
     temperature: float = 0.0,
+    names: Sequence[str] = ("fmap_xy", "symmetry_x", "symmetry_y"),
 ) -> Float[Tensor, "*B"]:
     """``mean_g || C S_x^g - S_y^g C ||^2``: the map carries the symmetries of x to those of y.
 
@@ -63,6 +66,7 @@ def orbit_consistency_fmap(
         pairings: ``(A, G)`` rows of element ids: element g of x goes with ``pairings[a, g]`` of y; the loss is the
             minimum over a.
         temperature: of that minimum (:func:`~torchqm.fmap.orbit_truth.soft_minimum`); 0: the minimum itself.
+        names: what the first three are called in messages.
 
     Returns:
         ``(...)`` one value for each pair.
@@ -77,10 +81,9 @@ def orbit_consistency_fmap(
         (0.0, 4.0)
     """
     sizes = Sizes()
-    sizes.bind("fmap_xy", fmap_xy, "... Ky Kx")
-    sizes.bind("symmetry_x", symmetry_x, "... G Kx Kx")
-    sizes.bind("symmetry_y", symmetry_y, "... G Ky Ky")
-    for name, value in (("fmap_xy", fmap_xy), ("symmetry_x", symmetry_x), ("symmetry_y", symmetry_y)):
+    given = ((fmap_xy, "... Ky Kx"), (symmetry_x, "... G Kx Kx"), (symmetry_y, "... G Ky Ky"))
+    for name, (value, dims) in zip(names, given, strict=True):
+        sizes.bind(name, value, dims)
         require_finite(name, value)
     if group_mask is not None:
         sizes.bind("group_mask", group_mask, "... G")
@@ -98,6 +101,7 @@ def orbit_consistency_points(
     group_mask: Bool[Tensor, "*B G"] | None = None,
     pairings: Int[Tensor, "A G"] | None = None,
     temperature: float = 0.0,
+    names: Sequence[str] = ("soft_xy", "group_x", "group_y"),
 ) -> Float[Tensor, "*B"]:
     """``mean_g sum_x a_x || (Pi f)(g_x(x)) - (Pi (f o g_y))(x) ||^2``: g_x(x) goes where g_y takes the image of x.
 
@@ -117,6 +121,7 @@ def orbit_consistency_points(
         group_mask: ``(..., G)`` real elements (every pairing must keep padded ones in place).
         pairings: ``(A, G)`` element g of x goes with ``pairings[a, g]`` of y; the loss is the minimum over a.
         temperature: of that minimum; 0: the minimum itself.
+        names: what the first three are called in messages.
 
     Returns:
         ``(...)`` one value for each pair (square of the unit of ``values_y``).
@@ -135,18 +140,17 @@ def orbit_consistency_points(
     sizes = Sizes()
     if isinstance(soft_xy, SoftMap):
         if values_y is None:
-            raise ValueError("values_y: must be given with a sparse soft_xy")
+            raise ValueError(f"values_y: must be given with a sparse {names[0]}")
         weights = soft_xy.weights
-        sizes.bind("soft_xy", weights, "... X k")
-        require_ids("soft_xy", soft_xy.indices, soft_xy.n_targets)
+        sizes.bind(names[0], weights, "... X k")
+        require_ids(names[0], soft_xy.indices, soft_xy.n_targets)
     else:
         weights = soft_xy
-        sizes.bind("soft_xy", soft_xy, "... X Y")
-    require_weights("soft_xy", weights)
-    sizes.bind("group_x", group_x, "... G X")
-    sizes.bind("group_y", group_y, "... G Y")
-    check_group("group_x", group_x, group_mask)
-    check_group("group_y", group_y, group_mask)
+        sizes.bind(names[0], soft_xy, "... X Y")
+    require_weights(names[0], weights)
+    for name, group, dims in zip(names[1:], (group_x, group_y), ("... G X", "... G Y"), strict=True):
+        sizes.bind(name, group, dims)
+        check_group(name, group, group_mask)
     if mass_x is None:
         areas = torch.full_like(weights[..., 0], 1.0 / weights.shape[-2])
     else:

@@ -7,9 +7,11 @@ from torch import Tensor
 from torchqm.checks import Sizes, require_ids
 from torchqm.fmap.orbit_truth import point_weights
 from torchqm.fmap.tables import require_weights
+from torchqm.options import require_number
 from torchqm.spectral.soft_map import SoftMap
 
 __all__ = [
+    "EPS",
     "Soft",
     "bind_distances",
     "bind_points",
@@ -25,6 +27,9 @@ __all__ = [
 Soft = SoftMap | Float[Tensor, "*B X Y"]
 AnyRows = SoftMap | Tensor
 """A soft map at the samples only."""
+
+EPS = 1e-12
+"""Floor of the mass of which the logarithm is taken, unless another is given."""
 
 
 def negative_log_mass(soft: AnyRows, sets: Tensor, log_weights: bool, eps: float) -> Tensor:
@@ -120,5 +125,4 @@ def bind_distances(sizes: Sizes, dist_y: Tensor, group_y: Tensor) -> None:
 
 def require_eps(eps: float) -> None:
     """Raise ``ValueError`` unless ``eps`` is a floor of weights."""
-    if not 0 < eps < 1:
-        raise ValueError(f"eps: {eps} given, expected a number between 0 and 1")
+    require_number("eps", eps, above=0, below=1)

@@ -6,8 +6,9 @@ from torch import Tensor
 
 from torchqm.checks import enabled, require_ids, require_nonnegative
 from torchqm.fmap.tables import check_group
+from torchqm.options import require_number
 
-__all__ = ["images_of", "orbit_members", "point_weights", "soft_minimum"]
+__all__ = ["images_of", "orbit_members", "point_weights", "require_temperature", "soft_minimum"]
 
 COLDEST = 1e-30
 """Smallest temperature but zero: its inverse is finite in float32."""
@@ -103,8 +104,7 @@ def soft_minimum(
         >>> soft_minimum(torch.tensor([1.0, 1.0, 3.0]), 0.0).item(), soft_minimum(torch.ones(4), 0.5).item()
         (1.0, 1.0)
     """
-    if not (temperature == 0 or COLDEST <= temperature < float("inf")):
-        raise ValueError(f"temperature: {temperature} given, expected 0 or a number from {COLDEST} on")
+    require_temperature(temperature)
     counted = values if mask is None else values.masked_fill(~mask, torch.finfo(values.dtype).max)
     if temperature == 0:
         return counted.amin(-1)
@@ -112,3 +112,10 @@ def soft_minimum(
     powers = torch.exp(-(counted - least) / temperature)
     mean = powers.mean(-1) if mask is None else (powers * mask).sum(-1) / mask.sum(-1).clamp_min(1)
     return least[..., 0] - temperature * torch.log(mean)
+
+
+def require_temperature(temperature: float) -> None:
+    """Raise ``ValueError`` unless a soft minimum can have this temperature: 0, or a number with a finite inverse."""
+    require_number("temperature", temperature, least=0)
+    if 0 < temperature < COLDEST:
+        raise ValueError(f"temperature: {temperature} given, expected 0 or a number from {COLDEST} on")

@@ -10,8 +10,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchqm.checks import Sizes, enabled, require_finite, require_mask, require_nonnegative
+from torchqm.checks import Sizes, require_finite, require_mask
 from torchqm.fmap.commutativity import commutativity_mask, spectral_scale
+from torchqm.fmap.descriptor_terms import descriptor_coefficients, mean_energy, one_a_sample, weighted_descriptors
 from torchqm.fmap.rows import solve_rows
 
 __all__ = [
@@ -19,35 +20,6 @@ __all__ = [
     "regularized_blocks",
     "regularized_fmap",
 ]
-
-
-def descriptor_coefficients(
-    feat: Float[Tensor, "*B V C"],
-    evecs_trans: Float[Tensor, "*B K V"],
-    names: tuple[str, str] = ("feat", "evecs_trans"),
-) -> Float[Tensor, "*B K C"]:
-    """``Phi^T A f``: features at vertices, written in a basis.
-
-    Args:
-        feat: ``(..., V, C)`` values at vertices; where ``evecs_trans`` is zero (padding), any finite ones.
-        evecs_trans: ``(..., K, V)`` transposed basis times vertex areas.
-        names: what the two are called in messages.
-
-    Raises:
-        ValueError: shapes that do not fit, or values that are not finite.
-
-    Example:
-        >>> descriptor_coefficients(torch.tensor([[1.0], [3.0]]), torch.tensor([[0.5, 0.5]])).tolist()
-        [[2.0]]
-    """
-    sizes = Sizes()
-    sizes.bind(names[0], feat, "... V C")
-    sizes.bind(names[1], evecs_trans, "... K V")
-    coeffs = evecs_trans @ feat
-    if enabled() and not bool(torch.isfinite(coeffs).all()):  # small beside the features, which are looked at now only
-        require_finite(names[0], feat)
-        require_finite(names[1], evecs_trans)
-    return coeffs
 
 
 def regularized_fmap(
@@ -84,7 +56,7 @@ def regularized_fmap(
         sample_weights: s ``(...)``, not negative: how far the descriptors of each sample are trusted.
         ridge: r as a multiple of the mean descriptor energy (the mean diagonal entry of ``s A W A^T``, or 1 where that
             is zero): entries that neither descriptors nor commutativity determine become 0 instead of an error. Below
-            the precision of the dtype it does nothing.
+            the precision of the dtype it does nothing: give 1e-3 in float32, 1e-9 in float64.
         evals_mask_x: ``(..., Kx)`` true: real, false: padding.
         evals_mask_y: ``(..., Ky)`` the same of the target.
         scale: see :func:`torchqm.fmap.commutativity.commutativity_mask`.
@@ -180,7 +152,9 @@ def regularized_blocks(
                 e = e * m
             spectra.append(e)
     scale = spectral_scale(*spectra) if scale is None else scale
-    energy = _mean_energy([_weighted(a, weights, sample_weights, _sizes_of(a)) * a for a in coeffs_x], masks_x)
+    energy = mean_energy(
+        [weighted_descriptors(a, weights, sample_weights, _sizes_of(a)) * a for a in coeffs_x], masks_x
+    )
     found = []
     for a, b, u, v, mask_x, mask_y in zip(coeffs_x, coeffs_y, evals_x, evals_y, masks_x, masks_y, strict=True):
         options = (weights, sample_weights, ridge, mask_x, mask_y, scale, row_chunk, energy)
@@ -192,18 +166,6 @@ def _sizes_of(coeffs: Tensor) -> Sizes:
     sizes = Sizes()
     sizes.bind("coeffs_x", coeffs, "... Kx C")
     return sizes
-
-
-def _mean_energy(products: Sequence[Tensor], masks: Sequence[Tensor | None]) -> Tensor:
-    """``(..., 1, 1)`` mean over the real functions of all blocks of the sum over their descriptors; 1 instead of 0."""
-    total: Tensor | float = 0.0
-    count: Tensor | float = 0.0
-    for product, mask in zip(products, masks, strict=True):
-        energies = product.sum(-1)
-        total = total + (energies if mask is None else energies * mask).sum(-1)
-        count = count + (energies.shape[-1] if mask is None else mask.sum(-1))
-    mean = torch.as_tensor(total / torch.as_tensor(count).clamp_min(1))
-    return torch.where(mean > 0, mean, 1.0)[..., None, None]
 
 
 def _minimum(
@@ -239,15 +201,15 @@ def _minimum(
         sizes.bind("evals_mask_y", evals_mask_y, "... Ky")
         coeffs_y, evals_y = coeffs_y * evals_mask_y[..., None], evals_y * evals_mask_y
 
-    weighted = _weighted(coeffs_x, weights, sample_weights, sizes)
-    own = _mean_energy([weighted * coeffs_x], [evals_mask_x])
+    weighted = weighted_descriptors(coeffs_x, weights, sample_weights, sizes)
+    own = mean_energy([weighted * coeffs_x], [evals_mask_x])
     if energy is None:
         energy = own
     else:  # of a block that holds only what rounding leaves, nothing is known
         noise = own <= (sizes["C"] * torch.finfo(own.dtype).eps) ** 2 * energy
         weighted, coeffs_y = torch.where(noise, 0.0, weighted), torch.where(noise, 0.0, coeffs_y)
     gram = weighted @ coeffs_x.mT
-    diagonal = _one_a_sample(lmbda, sizes) * commutativity_mask(evals_x, evals_y, commutativity, gamma, scale)
+    diagonal = one_a_sample(lmbda, sizes) * commutativity_mask(evals_x, evals_y, commutativity, gamma, scale)
     if ridge:
         diagonal = diagonal + ridge * energy
     # Systems of padding have a solution, too: 0.
@@ -256,28 +218,3 @@ def _minimum(
     if evals_mask_y is not None:
         diagonal = torch.where(evals_mask_y[..., :, None], diagonal, energy.detach())
     return solve_rows(gram, diagonal.to(gram.dtype), coeffs_y @ weighted.mT, row_chunk)
-
-
-def _weighted(coeffs: Tensor, weights: Tensor | None, sample_weights: Tensor | None, sizes: Sizes) -> Tensor:
-    """``s A W``."""
-    if weights is not None:
-        sizes.bind("weights", weights, "C" if weights.ndim == 1 else "... C", any_dtype=True)
-        require_nonnegative("weights", weights)
-        coeffs = coeffs * weights[..., None, :].to(coeffs.dtype)
-    if sample_weights is not None:
-        sizes.bind("sample_weights", sample_weights[..., None], "... 1", any_dtype=True)
-        require_nonnegative("sample_weights", sample_weights)
-        coeffs = coeffs * sample_weights[..., None, None].to(coeffs.dtype)
-    return coeffs
-
-
-def _one_a_sample(lmbda: float | Tensor, sizes: Sizes) -> float | Tensor:
-    """To be multiplied with matrices."""
-    if not isinstance(lmbda, Tensor):
-        if not 0 <= lmbda < float("inf"):
-            raise ValueError(f"lmbda is {lmbda}; only finite numbers from zero are allowed")
-        return lmbda
-    if lmbda.ndim:
-        sizes.bind("lmbda", lmbda[..., None], "... 1", any_dtype=True)
-    require_nonnegative("lmbda", lmbda)
-    return lmbda[..., None, None] if lmbda.ndim else lmbda

@@ -5,12 +5,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchqm.checks import Sizes, enabled, require_finite, require_ids, require_mask
-from torchqm.fmap.pair_products import PairProducts, at_neighbours, by_blocks, rows_at_once
+from torchqm.fmap.feature_search import KINDS, best_neighbours, with_bias
+from torchqm.fmap.pair_products import PairProducts, at_neighbours
 from torchqm.spectral.soft_map import SoftMap
 
 __all__ = ["feature_neighbours", "soft_assignment", "soft_map"]
-
-KINDS = ("dot", "distance")
 
 
 def soft_assignment(log_alpha: Float[Tensor, "..."], tau: float = 0.2, dim: int = -1, hard: bool = False) -> Tensor:
@@ -37,6 +36,10 @@ def soft_assignment(log_alpha: Float[Tensor, "..."], tau: float = 0.2, dim: int 
     """
     _require_tau(tau)
     require_finite("log_alpha", log_alpha)
+    if not -log_alpha.ndim <= dim < log_alpha.ndim:
+        raise ValueError(f"dim: {dim} given, but log_alpha has {log_alpha.ndim} dimensions")
+    if not log_alpha.shape[dim]:
+        raise ValueError(f"log_alpha: shape {tuple(log_alpha.shape)} given, expected entries along dimension {dim}")
     # Shifted before it is divided: no temperature, however small, makes an infinity out of a finite similarity.
     alpha = torch.softmax((log_alpha - log_alpha.detach().amax(dim, keepdim=True)) / tau, dim)
     if not hard:
@@ -96,7 +99,7 @@ def soft_map(
     """
     _check(feat_x, feat_y, mask_x, mask_y, kind, k, include, chunk)
     _require_tau(tau)
-    feat_x, feat_y, bias = _prepared(feat_x, feat_y, mask_y, kind, normalize)
+    feat_x, feat_y, bias = with_bias(feat_x, feat_y, mask_y, kind, normalize)
     _require_range(feat_x, feat_y, tau, bias is not None)
     factor = (1.0 if bias is None else 2.0) / (tau.to(feat_x) if isinstance(tau, Tensor) else tau)
     real = mask_x
@@ -110,7 +113,7 @@ def soft_map(
             logits = logits.masked_fill(~mask_y[..., None, :], torch.finfo(logits.dtype).min)
         weights = torch.softmax(logits, -1)
         return weights if real is None else weights * real[..., None]
-    indices = _best(feat_x.detach(), feat_y.detach(), bias, mask_y, k, include, chunk)
+    indices = best_neighbours(feat_x.detach(), feat_y.detach(), bias, mask_y, k, include, chunk)
     logits = PairProducts.apply(feat_x, feat_y, indices, chunk)
     if bias is not None:
         logits = logits + at_neighbours(bias, indices)
@@ -140,65 +143,8 @@ def feature_neighbours(
     """
     _check(feat_x, feat_y, None, mask_y, kind, k, None, chunk)
     with torch.no_grad():
-        feat_x, feat_y, bias = _prepared(feat_x.detach(), feat_y.detach(), mask_y, kind, normalize)
-        return _best(feat_x, feat_y, bias, mask_y, k, None, chunk)
-
-
-def _best(
-    feat_x: Tensor,
-    feat_y: Tensor,
-    bias: Tensor | None,
-    mask_y: Tensor | None,
-    k: int,
-    include: Tensor | None,
-    chunk: int | None,
-) -> Tensor:
-    limits = torch.finfo(feat_y.dtype)
-    columns = feat_y.transpose(-1, -2)
-
-    def block(at: slice) -> Tensor:
-        scores = feat_x[..., at, :] @ columns
-        if bias is not None:
-            scores = scores + bias.detach()[..., None, :]
-        if mask_y is not None:
-            scores = scores.masked_fill(~mask_y[..., None, :], limits.min)
-        if include is not None:
-            wanted = include[..., at, :]
-            raised = torch.full_like(wanted, limits.min, dtype=scores.dtype).masked_fill(wanted >= 0, limits.max)
-            scores = scores.scatter_reduce(-1, wanted.clamp_min(0), raised, "amax")
-        return scores.topk(k, -1).indices
-
-    best = by_blocks(block, feat_x.shape[-2], rows_at_once(feat_x, feat_y.shape[-2], chunk))
-    if include is None:
-        return best
-    # Those that were to be kept came first; the order is by similarity again.
-    logits = PairProducts.apply(feat_x, feat_y, best, chunk)
-    if bias is not None:
-        logits = logits + at_neighbours(bias.detach(), best)
-    if mask_y is not None:
-        logits = logits.masked_fill(~at_neighbours(mask_y, best), limits.min)
-    return torch.gather(best, -1, logits.argsort(-1, descending=True))
-
-
-def _prepared(
-    feat_x: Tensor, feat_y: Tensor, mask_y: Tensor | None, kind: str, normalize: bool
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Features and a bias of each y with which the similarity is ``<f_x, f_y> + bias_y``, half the squared distance."""
-    if normalize:
-        feat_x, feat_y = _unit(feat_x), _unit(feat_y)
-    if kind == "dot":
-        return feat_x, feat_y, None
-    # Distances do not change when all features move: around their mean the squares below lose no digits.
-    weight = torch.ones_like(feat_y[..., :1]) if mask_y is None else mask_y[..., None].to(feat_y.dtype)
-    centre = ((weight * feat_y).sum(-2, keepdim=True) / weight.sum(-2, keepdim=True).clamp_min(1)).detach()
-    feat_x, feat_y = feat_x - centre, feat_y - centre
-    return feat_x, feat_y, -feat_y.square().sum(-1) / 2
-
-
-def _unit(values: Tensor) -> Tensor:
-    squares = values.square().sum(-1, keepdim=True)
-    empty = squares == 0
-    return values * torch.where(empty, 0.0, torch.where(empty, 1.0, squares).rsqrt())
+        feat_x, feat_y, bias = with_bias(feat_x.detach(), feat_y.detach(), mask_y, kind, normalize)
+        return best_neighbours(feat_x, feat_y, bias, mask_y, k, None, chunk)
 
 
 def _require_tau(tau: float | Tensor) -> None:

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from torchqm.checks import Sizes, enabled, require_finite, require_ids, require_mask, require_nonnegative
+from torchqm.checks import Sizes, enabled, require_finite, require_ids, require_mask, require_nonnegative, require_real
 
 __all__ = ["check_group", "require_weights"]
 
@@ -33,6 +33,7 @@ def require_weights(name: str, values: Tensor, logarithms: bool = False) -> None
 
     With ``logarithms`` negative values and minus infinity are allowed.
     """
+    require_real(name, values)
     if not enabled() or not values.numel():
         return
     least, most = torch.aminmax(values.detach())  # NaN comes through

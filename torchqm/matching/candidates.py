@@ -18,7 +18,7 @@ from torchqm.matching.quality import commutator_norm, distance_change
 from torchqm.matching.quotient import QuotientMatch, pair_places, refine_fmap
 from torchqm.matching.shape import PreparedShape
 from torchqm.matching.synchronize import sample_weights, synchronized_halves
-from torchqm.symmetry.basis import SymmetrizedBasis, symmetrized_basis
+from torchqm.symmetry.basis import EvenOddBasis, symmetrized_basis
 
 __all__ = ["FullMap", "full_map_from_blocks", "sharpened"]
 
@@ -187,7 +187,7 @@ def _half(places: Places, known: KnownSymmetry) -> Places:
     return places.inside(known.sign >= 0)
 
 
-def _handed_over(small: SymmetrizedBasis, large: SymmetrizedBasis) -> Float[Tensor, "K K"]:
+def _handed_over(small: EvenOddBasis, large: EvenOddBasis) -> Float[Tensor, "K K"]:
     """Even functions of a smaller basis written in the first even functions of a larger one."""
     n = min(small.even.k, large.even.k)
     return large.even_coeffs[: small.full.k, :n].T @ small.even_coeffs

@@ -13,7 +13,7 @@ from torchqm.geometry.mesh import Mesh
 from torchqm.matching.initial import unit_columns_pair
 from torchqm.matching.parameters import MatchError
 from torchqm.spectral.basis import SpectralBasis
-from torchqm.symmetry.basis import SymmetrizedBasis
+from torchqm.symmetry.basis import EvenOddBasis
 from torchqm.symmetry.orientation import function_pairs, orientation_coefficients
 
 __all__ = ["OddMap", "join_blocks", "solve_odd"]
@@ -93,8 +93,8 @@ def solve_odd(
 
 
 def join_blocks(
-    x: SymmetrizedBasis,
-    y: SymmetrizedBasis,
+    x: EvenOddBasis,
+    y: EvenOddBasis,
     fmap_even: Float[Tensor, "Key Kex"],
     fmap_odd: Float[Tensor, "Koy Kox"],
 ) -> Float[Tensor, "Ky Kx"]:

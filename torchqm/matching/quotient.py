@@ -16,7 +16,7 @@ from torchqm.matching.initial import basis_size, curvature_descriptors, fmap_fro
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.features import local_features
-from torchqm.symmetry.basis import SymmetrizedBasis, symmetrized_basis
+from torchqm.symmetry.basis import EvenOddBasis, symmetrized_basis
 from torchqm.symmetry.group import SymmetryGroup
 
 __all__ = [
@@ -42,8 +42,8 @@ class QuotientMatch:
         first: the least-squares map that ``fmap`` began at, if it is of the same size.
     """
 
-    source: SymmetrizedBasis
-    target: SymmetrizedBasis
+    source: EvenOddBasis
+    target: EvenOddBasis
     fmap: Float[Tensor, "Key Kex"]
     time: float = 0.0
     first: Float[Tensor, "Key Kex"] | None = None

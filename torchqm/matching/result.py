@@ -16,7 +16,7 @@ from torch import Tensor
 from torchqm.fmap.convert import p2p_to_fmap
 from torchqm.geometry.files import write_whole
 from torchqm.spectral.basis import SpectralBasis
-from torchqm.symmetry.basis import SymmetrizedBasis, symmetrized_basis
+from torchqm.symmetry.basis import EvenOddBasis, symmetrized_basis
 from torchqm.symmetry.group import SymmetryGroup
 from torchqm.version import __version__
 
@@ -125,7 +125,7 @@ class SymmetryResult:
         return torch.stack([p2p_to_fmap(p2p, self.basis, self.basis) for p2p in self.maps])
 
     @cached_property
-    def symmetrized(self) -> SymmetrizedBasis:
+    def symmetrized(self) -> EvenOddBasis:
         """The even and odd functions: ``.even`` is a basis of L2+, ``.odd`` of its complement."""
         return symmetrized_basis(self.basis, SymmetryGroup(self.maps))
 

@@ -13,7 +13,7 @@ from torchqm.matching.described import pair_descriptors
 from torchqm.matching.initial import basis_size, fmap_from_coefficients
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.shape import PreparedShape
-from torchqm.symmetry.basis import SymmetrizedBasis, split_by_projector, symmetrized_basis
+from torchqm.symmetry.basis import EvenOddBasis, split_by_projector, symmetrized_basis
 from torchqm.symmetry.group import SymmetryGroup
 
 __all__ = ["SemiQuotientMatch", "match_semi_quotient", "pull_back", "sharpen_orbit_map"]
@@ -34,8 +34,8 @@ class SemiQuotientMatch:
     """
 
     fmap: Float[Tensor, "Key Kx"]
-    target: SymmetrizedBasis
-    source: SymmetrizedBasis
+    target: EvenOddBasis
+    source: EvenOddBasis
     even: Float[Tensor, "Key Kex"]
     time: float = 0.0
     search: SurfaceSearch | None = None

@@ -5,6 +5,8 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from torchqm.checks import Sizes, require_finite
+from torchqm.options import require_number, require_whole
 from torchqm.symmetry.halves import symmetrized_projector
 from torchqm.symmetry.soft import projection_matrices
 from torchqm.symmetry.split import SplitBases, symmetrized_bases
@@ -26,6 +28,9 @@ class SymmetrizedBasis(nn.Module):
         rtol: gaps of eigenvalues that count as zero in the backward pass, as a share of the largest eigenvalue; None:
             1e-10 in float64 and 1e-5 in float32.
 
+    Raises:
+        ValueError: a negative width or ``rtol``.
+
     Example:
         >>> import torch
         >>> evecs = torch.tensor([[[1.0, 1.0], [1.0, -1.0]]]) / 2**0.5
@@ -37,6 +42,10 @@ class SymmetrizedBasis(nn.Module):
 
     def __init__(self, k_even: int | None = None, k_odd: int | None = None, rtol: float | None = None) -> None:
         super().__init__()
+        require_whole("k_even", k_even, 0, optional=True)
+        require_whole("k_odd", k_odd, 0, optional=True)
+        if rtol is not None:
+            require_number("rtol", rtol, least=0)
         self.k_even, self.k_odd, self.rtol = k_even, k_odd, rtol
 
     def forward(
@@ -83,6 +92,10 @@ class SymmetrizedBasis(nn.Module):
             mass: ``(B, V)``.
             **given: as in :meth:`forward`.
         """
+        sizes = Sizes()
+        sizes.bind("evecs", evecs, "... V K")
+        sizes.bind("coeffs", coeffs, "... K C")
+        require_finite("coeffs", coeffs)
         even = self.projector(evecs, mass, **given) @ coeffs
         return even, coeffs - even
 

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchqm.checks import Sizes, require_finite, require_ids, require_mask, require_nonnegative
+from torchqm.options import require_flag, require_number, require_whole
 from torchqm.spectral.descriptors import WaveEnergies, heat_kernel_values, wave_kernel_values
 from torchqm.symmetry.orientation import function_pairs, orientation_descriptors
 
@@ -44,12 +45,13 @@ class WaveKernelSignature(nn.Module):
     ) -> None:
         super().__init__()
         if energies is None:
-            if n < 2 or k < 3:
-                raise ValueError(f"n={n}, k={k}: at least 2 energies and 3 eigenfunctions are needed")
+            require_whole("n", n, 2)
+            require_whole("k", k, 3)
             low, high = log(4 * pi), log(4 * pi * (k - 1))
             sigma = 7 * (high - low) / (n + 28)
             energies = WaveEnergies(torch.linspace(low + 2 * sigma, high - 2 * sigma, n), sigma)
-        start = energies.log_energies.to(torch.get_default_dtype())
+        require_number("energies.sigma", energies.sigma, above=0)
+        start = _row("energies.log_energies", energies.log_energies)
         _learn(self, learnable, log_energies=start.clone(), log_sigma=torch.full_like(start, log(energies.sigma)))
 
     def forward(
@@ -96,12 +98,13 @@ class HeatKernelSignature(nn.Module):
     ) -> None:
         super().__init__()
         if times is None:
-            if n < 1 or k < 3:
-                raise ValueError(f"n={n}, k={k}: at least one time and 3 eigenfunctions are needed")
+            require_whole("n", n)
+            require_whole("k", k, 3)
             scale = log(4 * log(10))
             times = torch.linspace(scale - log(4 * pi * (k - 1)), scale - log(4 * pi), n).exp()
+        times = _row("times", times)
         require_nonnegative("times", times)
-        _learn(self, learnable, log_times=times.to(torch.get_default_dtype()).clamp_min(1e-30).log())
+        _learn(self, learnable, log_times=times.clamp_min(1e-30).log())
 
     def forward(
         self,
@@ -141,12 +144,13 @@ class OrientationDescriptors(nn.Module):
 
     def __init__(self, n_features: int, n_pairs: int | None = None, seed: int = 0) -> None:
         super().__init__()
-        if n_features < 2:
-            raise ValueError(f"n_features={n_features}: at least 2 features make a pair")
+        require_whole("n_features", n_features, 2)
+        require_whole("n_pairs", n_pairs, optional=True)
+        require_whole("seed", seed, least=None)
         pairs = function_pairs(n_features + 1) - 1  # here no function is the constant one
         if n_pairs is not None:
-            if not 1 <= n_pairs <= pairs.shape[1]:
-                raise ValueError(f"n_pairs={n_pairs}: {n_features} features make 1..{pairs.shape[1]} pairs")
+            if n_pairs > pairs.shape[1]:
+                raise ValueError(f"n_pairs: {n_pairs} given, but {n_features} features make 1..{pairs.shape[1]} pairs")
             drawn = torch.randperm(pairs.shape[1], generator=torch.Generator().manual_seed(seed))[:n_pairs]
             pairs = pairs[:, drawn.sort().values]
         self.n_features = n_features
@@ -174,7 +178,18 @@ class OrientationDescriptors(nn.Module):
         return f"n_features={self.n_features}, n_pairs={self.pairs.shape[1]}"
 
 
+def _row(name: str, values: Tensor) -> Tensor:
+    """Numbers to begin with, in the dtype of parameters."""
+    Sizes().bind(name, values, "n")
+    if not values.numel():
+        raise ValueError(f"{name}: no number given, expected at least one")
+    values = values.to(torch.get_default_dtype())
+    require_finite(name, values)
+    return values
+
+
 def _learn(layer: nn.Module, learnable: bool, **values: Tensor) -> None:
+    require_flag("learnable", learnable)
     for name, value in values.items():
         if learnable:
             layer.register_parameter(name, nn.Parameter(value))
@@ -196,4 +211,6 @@ def _checked_area(evals: Tensor, evecs: Tensor, mass: Tensor, evals_mask: Tensor
     require_finite("evals", evals)
     require_finite("evecs", evecs)
     require_nonnegative("mass", mass)
-    return mass.sum(-1, keepdim=True)
+    area = mass.sum(-1, keepdim=True)
+    require_mask("mass > 0", mass > 0)
+    return area

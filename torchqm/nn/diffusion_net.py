@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchqm.checks import Sizes, require_finite, require_mask, require_nonnegative
 from torchqm.geometry.gradient_features import StackedGradient, gradient_features, stacked_gradient
 from torchqm.nn.features import MLP
+from torchqm.options import require_call, require_choice, require_counts, require_flag, require_number, require_whole
 from torchqm.spectral.diffusion import spectral_diffusion
 
 __all__ = ["DiffusionNet"]
@@ -78,16 +79,16 @@ class DiffusionNet(nn.Module):
         diffusion_method: str = "spectral",
     ) -> None:
         super().__init__()
-        if min(C_in, C_out, C_width, N_block) < 1:
-            raise ValueError(f"{C_in=}, {C_out=}, {C_width=}, {N_block=}: all must be at least 1")
-        if outputs_at not in _OUTPUTS:
-            raise ValueError(f"outputs_at={outputs_at!r}: supported are {', '.join(_OUTPUTS)}")
-        if diffusion_method != "spectral":
-            raise ValueError(f"diffusion_method={diffusion_method!r}: supported is spectral")
-        probability = 0.5 if dropout is True else float(dropout)
-        if not 0 <= probability < 1:
-            raise ValueError(f"dropout={dropout}: True, False or a probability from 0 to below 1 is supported")
-        hidden = (C_width, C_width) if mlp_hidden_dims is None else tuple(mlp_hidden_dims)
+        for name, count in (("C_in", C_in), ("C_out", C_out), ("C_width", C_width), ("N_block", N_block)):
+            require_whole(name, count)
+        require_call("last_activation", last_activation)
+        require_choice("outputs_at", outputs_at, _OUTPUTS)
+        require_choice("diffusion_method", diffusion_method, ("spectral",))
+        require_flag("with_gradient_features", with_gradient_features)
+        require_flag("with_gradient_rotations", with_gradient_rotations)
+        probability = {True: 0.5, False: 0.0}[dropout] if isinstance(dropout, bool) else dropout
+        require_number("dropout", probability, least=0, below=1)
+        hidden = (C_width, C_width) if mlp_hidden_dims is None else require_counts("mlp_hidden_dims", mlp_hidden_dims)
         self.c_in, self.last_activation, self.outputs_at = C_in, last_activation, outputs_at
         self.with_gradient_features = with_gradient_features
         self.first = nn.Linear(C_in, C_width)

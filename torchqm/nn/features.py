@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from torchqm.checks import Sizes, require_finite, require_mask
+from torchqm.checks import Sizes, require_finite, require_mask, require_nonnegative
 from torchqm.geometry.normals import centred_unit_area, normals_at_vertices
 from torchqm.nn.descriptors import HeatKernelSignature, WaveKernelSignature
+from torchqm.options import require_counts, require_flag, require_number, require_whole
 
 __all__ = ["MLP", "InputFeatures"]
 
@@ -58,6 +59,7 @@ class InputFeatures(nn.Module):
 
     def __init__(self, names: Sequence[str] = ("wks",), n: int = 128, k: int = 128, learnable: bool = False) -> None:
         super().__init__()
+        require_flag("learnable", learnable)
         self.names = (names,) if isinstance(names, str) else tuple(names)
         unknown = [name for name in self.names if name not in self.KEYS]
         if unknown or not self.names or len(set(self.names)) < len(self.names):
@@ -84,6 +86,11 @@ class InputFeatures(nn.Module):
         with torch.autocast(item["mass"].device.type, enabled=False):
             features = torch.cat([self._feature(name, item) for name in self.names], -1)
         mask = item.get("verts_mask")
+        if mask is not None:
+            sizes = Sizes()
+            sizes.bind("mass", item["mass"], "... V")
+            sizes.bind("verts_mask", mask, "... V")
+            require_mask("verts_mask", mask)
         return features if mask is None else features.masked_fill(~mask[..., None], 0.0)
 
     def _feature(self, name: str, item: Mapping[str, Any]) -> Tensor:
@@ -97,6 +104,8 @@ class InputFeatures(nn.Module):
         sizes.bind("verts", verts, "... V 3")
         sizes.bind("mass", mass, "... V")
         require_finite("verts", verts)
+        require_nonnegative("mass", mass)
+        require_mask("mass > 0", mass > 0)
         scaled = centred_unit_area(verts, mass)
         return scaled if name == "xyz" else normals_at_vertices(scaled, item["faces"])
 
@@ -113,7 +122,10 @@ class MLP(nn.Module):
         c_out: channels returned.
         hidden: channels of the layers between.
         layer_norm: normalise the channels of each point before each ReLU.
-        dropout: probability to drop a channel after each ReLU, in training.
+        dropout: probability to drop a channel after each ReLU, in training; below 1.
+
+    Raises:
+        ValueError: an option out of range.
 
     Example:
         >>> MLP(16, 4)(torch.zeros(2, 50, 16)).shape
@@ -129,9 +141,11 @@ class MLP(nn.Module):
         dropout: float = 0.0,
     ) -> None:
         super().__init__()
-        sizes = (c_in, *hidden, c_out)
-        if min(sizes) < 1:
-            raise ValueError(f"c_in={c_in}, c_out={c_out}, hidden={tuple(hidden)}: all must be at least 1")
+        require_whole("c_in", c_in)
+        require_whole("c_out", c_out)
+        require_flag("layer_norm", layer_norm)
+        require_number("dropout", dropout, least=0, below=1)
+        sizes = (c_in, *require_counts("hidden", hidden), c_out)
         layers: list[nn.Module] = []
         for before, after in pairwise(sizes[:-1]):
             layers += [nn.Linear(before, after), nn.LayerNorm(after) if layer_norm else nn.Identity(), nn.ReLU()]

@@ -1,6 +1,7 @@
 """Losses that know about symmetry, and the usual ones of functional maps, as layers."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 from jaxtyping import Bool, Float, Int
@@ -14,10 +15,14 @@ from torchqm.fmap.orbit_loss import (
     map_orbit_loss,
     spectral_orbit_loss,
 )
+from torchqm.fmap.orbit_terms import require_eps
+from torchqm.fmap.orbit_truth import require_temperature
+from torchqm.options import require_choice, require_flag, require_number
 
 __all__ = ["FunctionalMapLoss", "OrbitConsistencyLoss", "PointToOrbitLoss"]
 
 REDUCTIONS = ("mean", "none")
+SURFMNET_NAMES = ("C12", "C21", "evals_1", "evals_2", "evals_mask_1", "evals_mask_2")
 CONSISTENCIES: dict[str, Callable[..., Tensor]] = {"fmap": orbit_consistency_fmap, "points": orbit_consistency_points}
 
 
@@ -39,6 +44,12 @@ FORMS = {
     ),
 }
 
+OPTIONS: dict[str, Callable[[Any], None]] = {
+    "eps": require_eps,
+    "log_weights": partial(require_flag, "log_weights"),
+    "temperature": require_temperature,
+}
+
 
 class PointToOrbitLoss(nn.Module):
     """Supervision up to symmetry: any of the equally good answers costs the same. T is the truth, ``a_x`` are areas.
@@ -58,7 +69,7 @@ class PointToOrbitLoss(nn.Module):
             ``temperature``, ``log_weights`` and ``eps`` of :func:`~torchqm.fmap.orbit_loss.map_orbit_loss`.
 
     Raises:
-        ValueError: unknown ``form`` or ``reduction``, or an option that the form does not have.
+        ValueError: unknown ``form`` or ``reduction``, an option that the form does not have, or one out of range.
 
     Example:
         >>> import torch
@@ -71,13 +82,13 @@ class PointToOrbitLoss(nn.Module):
 
     def __init__(self, form: str = "assignment", reduction: str = "mean", **options: Any) -> None:
         super().__init__()
-        if form not in FORMS:
-            raise ValueError(f"form: {form!r} given, allowed are {', '.join(FORMS)}")
-        _require_reduction(reduction)
+        require_choice("form", form, FORMS)
+        require_choice("reduction", reduction, REDUCTIONS)
         known = FORMS[form].options
         for name in options:
             if name not in known:
                 raise ValueError(f"{name}: the form {form!r} has no such option; it has {', '.join(known) or 'none'}")
+            OPTIONS[name](options[name])
         self.form, self.reduction, self.options = form, reduction, options
 
     def forward(
@@ -97,7 +108,8 @@ class PointToOrbitLoss(nn.Module):
             truth_mask: ``(B, N)`` false: no truth (``corr_mask`` of a padded batch).
             **given: by name, what the form needs: ``fmap_even (B, Ky, Kx)``, ``evecs_even_x (B, X, Kx)`` and
                 ``evecs_even_y (B, Y, Ky)`` (spectral); ``soft_xy`` and ``group_y (B, G, Y)`` with ``group_mask (B, G)``
-                (the others); ``dist_y (B, Y, Y)`` or ``orbit_dist (B, N, Y)`` (distance; ``dist_y`` also map).
+                (the others); ``dist_y (B, Y, Y)``, or ``orbit_dist (B, N, Y)`` without a group (distance; ``dist_y``
+                also map).
 
         Raises:
             ValueError: something is missing, not of this form, or does not fit.
@@ -109,14 +121,13 @@ class PointToOrbitLoss(nn.Module):
         for name in given:
             if name not in needed + allowed:
                 raise ValueError(f"{name}: given, but the form {self.form!r} takes {', '.join(needed + allowed)}")
-        points = {"p2p_xy": p2p_xy, "mass_x": mass_x, "samples": samples, "truth_mask": truth_mask}
-        return _reduced(function(**points, **given, **self.options), self.reduction)
+        loss = function(p2p_xy=p2p_xy, mass_x=mass_x, samples=samples, truth_mask=truth_mask, **given, **self.options)
+        return _reduced(loss, self.reduction, "p2p_xy")
 
     def extra_repr(self) -> str:
         """The options, for ``print``."""
-        return ", ".join(
-            f"{k}={v}" for k, v in {"form": self.form, "reduction": self.reduction, **self.options}.items()
-        )
+        shown = {"form": self.form, "reduction": self.reduction, **self.options}
+        return ", ".join(f"{name}={value}" for name, value in shown.items())
 
 
 class FunctionalMapLoss(nn.Module):
@@ -152,8 +163,7 @@ class FunctionalMapLoss(nn.Module):
     def __init__(self, w_bij: float = 1.0, w_orth: float = 1.0, w_lap: float = 1e-3) -> None:
         super().__init__()
         for name, weight in (("w_bij", w_bij), ("w_orth", w_orth), ("w_lap", w_lap)):
-            if not 0 <= weight < float("inf"):
-                raise ValueError(f"{name}: {weight} given, expected a number from 0 on")
+            require_number(name, weight, least=0)
         self.w_bij, self.w_orth, self.w_lap = w_bij, w_orth, w_lap
 
     def forward(
@@ -175,9 +185,9 @@ class FunctionalMapLoss(nn.Module):
             evals_mask_1: ``(B, K1)`` real functions of 1.
             evals_mask_2: ``(B, K2)`` real functions of 2.
         """
-        found = surfmnet_losses(C12, C21, evals_1, evals_2, evals_mask_1, evals_mask_2)
+        found = surfmnet_losses(C12, C21, evals_1, evals_2, evals_mask_1, evals_mask_2, SURFMNET_NAMES)
         weights = {"l_bij": self.w_bij, "l_orth": self.w_orth, "l_lap": self.w_lap}
-        return {name: weight * found[name].mean() for name, weight in weights.items() if weight > 0}
+        return {name: weight * _reduced(found[name], "mean", "C12") for name, weight in weights.items() if weight > 0}
 
     def extra_repr(self) -> str:
         """The options, for ``print``."""
@@ -198,7 +208,7 @@ class OrbitConsistencyLoss(nn.Module):
         temperature: of the minimum over ``pairings``; 0: the minimum itself.
 
     Raises:
-        ValueError: unknown ``form`` or ``reduction``.
+        ValueError: unknown ``form`` or ``reduction``, or a negative or infinite ``temperature``.
 
     Example:
         >>> import torch
@@ -209,9 +219,9 @@ class OrbitConsistencyLoss(nn.Module):
 
     def __init__(self, form: str = "fmap", reduction: str = "mean", temperature: float = 0.0) -> None:
         super().__init__()
-        if form not in CONSISTENCIES:
-            raise ValueError(f"form: {form!r} given, allowed are {', '.join(CONSISTENCIES)}")
-        _require_reduction(reduction)
+        require_choice("form", form, CONSISTENCIES)
+        require_choice("reduction", reduction, REDUCTIONS)
+        require_temperature(temperature)
         self.form, self.reduction, self.temperature = form, reduction, temperature
 
     def forward(self, map_xy: Any, symmetry_x: Tensor, symmetry_y: Tensor, **given: Any) -> Float[Tensor, "..."]:
@@ -224,18 +234,17 @@ class OrbitConsistencyLoss(nn.Module):
             **given: by name: ``group_mask (B, G)``, ``pairings (A, G)``; for points ``values_y (B, Y, C)`` and
                 ``mass_x (B, X)``.
         """
-        loss = CONSISTENCIES[self.form](map_xy, symmetry_x, symmetry_y, temperature=self.temperature, **given)
-        return _reduced(loss, self.reduction)
+        given |= {"temperature": self.temperature, "names": ("map_xy", "symmetry_x", "symmetry_y")}
+        return _reduced(CONSISTENCIES[self.form](map_xy, symmetry_x, symmetry_y, **given), self.reduction, "map_xy")
 
     def extra_repr(self) -> str:
         """The options, for ``print``."""
         return f"form={self.form}, reduction={self.reduction}, temperature={self.temperature}"
 
 
-def _require_reduction(reduction: str) -> None:
-    if reduction not in REDUCTIONS:
-        raise ValueError(f"reduction: {reduction!r} given, allowed are {', '.join(REDUCTIONS)}")
-
-
-def _reduced(loss: Tensor, reduction: str) -> Tensor:
-    return loss.mean() if reduction == "mean" else loss
+def _reduced(loss: Tensor, reduction: str, name: str) -> Tensor:
+    if reduction == "none":
+        return loss
+    if not loss.numel():
+        raise ValueError(f"{name}: an empty batch given, which has no mean; at least one shape is needed")
+    return loss.mean()

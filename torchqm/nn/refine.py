@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchqm.fmap.unrolled import soft_icp, soft_upsample
+from torchqm.options import require_counts, require_flag, require_number, require_whole
 
 __all__ = ["QuotientICP", "SpectralUpsampling"]
 
@@ -17,10 +18,9 @@ class _Refinement(nn.Module):
 
     def __init__(self, steps: int, tau: float, learn_tau: bool, neighbours: int | None) -> None:
         super().__init__()
-        if tau <= 0:
-            raise ValueError(f"tau={tau}: the temperature must be positive")
-        if neighbours is not None and neighbours < 1:
-            raise ValueError(f"neighbours={neighbours}: a point has at least one partner; None is all of them")
+        require_number("tau", tau, above=0)
+        require_flag("learn_tau", learn_tau)
+        require_whole("neighbours", neighbours, optional=True)
         self.steps, self.neighbours = steps, neighbours
         self._fixed = tau
         self.log_tau = nn.Parameter(torch.tensor(log(tau))) if learn_tau else None
@@ -52,8 +52,7 @@ class QuotientICP(_Refinement):
     def __init__(
         self, steps: int = 5, tau: float = 0.02, learn_tau: bool = False, neighbours: int | None = None
     ) -> None:
-        if steps < 0:
-            raise ValueError(f"steps={steps}: the number of iterations must not be negative")
+        require_whole("steps", steps, 0)
         super().__init__(steps, tau, learn_tau, neighbours)
 
     def forward(
@@ -88,7 +87,7 @@ class SpectralUpsampling(_Refinement):
     """Growing bases with soft partners; see :func:`torchqm.fmap.unrolled.soft_upsample`.
 
     Args:
-        sizes: numbers of functions, one after the other, e.g. :func:`torchqm.fmap.growing_sizes`.
+        sizes: numbers of functions, one after the other, e.g. of :func:`torchqm.fmap.growing_sizes`.
         steps: iterations at each.
         tau: temperature, as in :class:`QuotientICP`.
         learn_tau: whether it is a parameter.
@@ -106,10 +105,9 @@ class SpectralUpsampling(_Refinement):
         learn_tau: bool = False,
         neighbours: int | None = None,
     ) -> None:
-        if steps < 1:
-            raise ValueError(f"steps={steps}: each size needs at least one iteration")
+        require_whole("steps", steps)
         super().__init__(steps, tau, learn_tau, neighbours)
-        self.sizes = tuple(sizes)
+        self.sizes = require_counts("sizes", sizes)
 
     def forward(
         self,
@@ -118,8 +116,14 @@ class SpectralUpsampling(_Refinement):
         evecs_y: Float[Tensor, "*B Y Ly"],
         mass_x: Float[Tensor, "*B X"] | None = None,
         verts_mask_y: Bool[Tensor, "*B Y"] | None = None,
+        evals_mask_x: Bool[Tensor, "*B Lx"] | None = None,
+        evals_mask_y: Bool[Tensor, "*B Ly"] | None = None,
     ) -> Float[Tensor, "*B L L"]:
-        """The map at the last of the sizes."""
+        """The map at the last of the sizes, 0 at padded functions.
+
+        In a batch of shapes with different numbers of functions the masks say which are real: a shape that has less
+        than a size takes part with all of its own.
+        """
         return soft_upsample(
             fmap_xy,
             evecs_x,
@@ -130,6 +134,8 @@ class SpectralUpsampling(_Refinement):
             self.neighbours,
             mass_x,
             verts_mask_y,
+            evals_mask_x,
+            evals_mask_y,
         )
 
     def extra_repr(self) -> str:

@@ -6,7 +6,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchqm.fmap.feature_search import KINDS
 from torchqm.fmap.soft import soft_assignment, soft_map
+from torchqm.options import require_choice, require_flag, require_number, require_whole
 from torchqm.spectral.soft_map import SoftMap
 
 __all__ = ["Similarity", "SoftPointMap"]
@@ -30,6 +32,9 @@ class Similarity(nn.Module):
 
     def __init__(self, normalise_dim: int = -1, tau: float = 0.2, hard: bool = False) -> None:
         super().__init__()
+        require_whole("normalise_dim", normalise_dim, least=None)
+        require_number("tau", tau, above=0)
+        require_flag("hard", hard)
         self.dim, self.tau, self.hard = normalise_dim, tau, hard
 
     def forward(self, log_alpha: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
@@ -68,8 +73,14 @@ class SoftPointMap(nn.Module):
         chunk: int | None = None,
     ) -> None:
         super().__init__()
-        if not 0 < tau < math.inf:
-            raise ValueError(f"tau: {tau} given, expected a positive number")
+        require_number("tau", tau, above=0)
+        require_flag("learn_tau", learn_tau)
+        require_whole("k", k, optional=True)
+        require_choice("kind", kind, KINDS)
+        require_flag("normalize", normalize)
+        require_whole("chunk", chunk, optional=True)
+        if k is None and chunk is not None:
+            raise ValueError(f"chunk: {chunk} given, but only of use together with k")
         self._tau = tau
         self.log_tau = nn.Parameter(torch.tensor(math.log(tau))) if learn_tau else None
         self.k, self.kind, self.normalize, self.chunk = k, kind, normalize, chunk

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchqm.checks import Sizes, require_finite, require_mask
 from torchqm.fmap.commutativity import COMMUTATIVITY
 from torchqm.fmap.regularized import descriptor_coefficients, regularized_blocks
+from torchqm.options import require_choice, require_flag, require_number, require_whole
 
 __all__ = ["FunctionalMapSolver"]
 
@@ -32,7 +33,7 @@ class FunctionalMapSolver(nn.Module):
             :func:`torchqm.fmap.commutativity.commutativity_mask`.
         learn_lmbda: make ``lmbda`` a parameter; its logarithm is learned, so that it stays positive.
         extra_weight: weight of the further descriptors against the features.
-        ridge: multiple of the mean descriptor energy added to every diagonal.
+        ridge: multiple of the mean descriptor energy added to every diagonal; to have a say in float32, 1e-4 or more.
         row_chunk: rows solved at once, to bound memory: the backward pass then factors again. None: all, and the factor
             is kept for the backward pass.
 
@@ -60,12 +61,15 @@ class FunctionalMapSolver(nn.Module):
         row_chunk: int | None = None,
     ) -> None:
         super().__init__()
-        if learn_lmbda and not lmbda > 0:
-            raise ValueError(f"lmbda is {lmbda}; to be learned it must be above zero")
-        if commutativity not in COMMUTATIVITY:
-            raise ValueError(f"commutativity is {commutativity!r}; allowed are {', '.join(COMMUTATIVITY)}")
-        if not 0 <= extra_weight < float("inf"):
-            raise ValueError(f"extra_weight is {extra_weight}; only finite numbers from zero are allowed")
+        require_flag("learn_lmbda", learn_lmbda)
+        if learn_lmbda:  # its logarithm is
+            require_number("lmbda", lmbda, above=0)
+        for name, number in (("lmbda", lmbda), ("extra_weight", extra_weight), ("ridge", ridge)):
+            require_number(name, number, least=0)
+        require_number("resolvant_gamma", resolvant_gamma, above=0)
+        require_flag("bidirectional", bidirectional)
+        require_choice("commutativity", commutativity, COMMUTATIVITY)
+        require_whole("row_chunk", row_chunk, optional=True)
         self.resolvant_gamma, self.bidirectional, self.commutativity = resolvant_gamma, bidirectional, commutativity
         self.extra_weight, self.ridge, self.row_chunk = extra_weight, ridge, row_chunk
         self._lmbda = lmbda
@@ -126,10 +130,11 @@ class FunctionalMapSolver(nn.Module):
             None. With odd bases each of the two is a pair: even to even, odd to odd.
 
         Raises:
-            ValueError: see :func:`torchqm.fmap.regularized.regularized_fmap` (float32 systems that rounding makes
-                singular are among them: a ``ridge`` of 1e-6 lets a network go on that has few independent descriptors
-                at first, where ULRSSM's inverses return noise); also where one of several arguments that
-                need each other is missing.
+            ValueError: see :func:`torchqm.fmap.regularized.regularized_fmap`; also where one of several arguments that
+                need each other is missing. In float32 rows count as undetermined, too, of which rounding would leave
+                one digit or less, and ULRSSM's inverses return noise: of fewer descriptors than functions that are
+                large against ``lmbda``, some ten times as large as functions on a shape of area 1, e.g. because
+                shapes were not scaled. Scale them, or give a ``ridge`` of 1e-3 (float32), or float64.
         """
         if (extra_x is None) != (extra_y is None):
             raise ValueError("extra_x, extra_y: give both or none")
@@ -155,8 +160,8 @@ class FunctionalMapSolver(nn.Module):
         for name, (value, dims) in every.items():
             if value is not None:
                 sizes.bind(name, value, dims)
-                if name.startswith("evals_mask"):
-                    require_mask(name, value)
+                if "mask" in name:  # a shape without symmetry has no odd functions
+                    require_mask(name, value, empty="odd" in name)
                 elif name.startswith("evals"):
                     require_finite(name, value)
         bases_x: list[_Basis] = [(evals_x, evecs_trans_x, evals_mask_x)]

@@ -1,10 +1,13 @@
 """Soft point maps: for each point of one shape, weights over a few points of another. Differentiable, V x k in size."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.utils._pytree import GetAttrKey, register_pytree_node
 
 __all__ = ["SoftMap", "soft_fmap"]
 
@@ -13,7 +16,8 @@ __all__ = ["SoftMap", "soft_fmap"]
 class SoftMap:
     """A sparse row-stochastic matrix: row x holds the weights of the points of y that x may go to.
 
-    As an operator it pulls functions on y back to x: ``(Pi f)(x) = sum_j weights[x, j] f(indices[x, j])``.
+    As an operator it pulls functions on y back to x: ``(Pi f)(x) = sum_j weights[x, j] f(indices[x, j])``. Functions
+    that take or return one work under :func:`torch.func.vmap`.
 
     Args:
         indices: ``(..., X, k)`` vertices of y.
@@ -62,7 +66,30 @@ class SoftMap:
         return torch.gather(self.indices, -1, self.weights.argmax(-1, keepdim=True))[..., 0]
 
 
-torch.export.register_dataclass(SoftMap)  # a layer may return one; under vmap it may not: it holds a number
+def _tensors(soft: SoftMap) -> tuple[list[Any], int]:
+    return [soft.indices, soft.weights], soft.n_targets
+
+
+def _tensors_with_names(soft: SoftMap) -> tuple[list[tuple[Any, Any]], int]:
+    return [(GetAttrKey("indices"), soft.indices), (GetAttrKey("weights"), soft.weights)], soft.n_targets
+
+
+def _from_tensors(leaves: Iterable[Any], n_targets: int) -> SoftMap:
+    soft = object.__new__(SoftMap)  # leaves may be numbers of dimensions instead of tensors, which no check must see
+    for name, value in zip(("indices", "weights", "n_targets"), (*leaves, n_targets), strict=True):
+        object.__setattr__(soft, name, value)
+    return soft
+
+
+# So that a layer that takes or returns one can be exported, and mapped by torch.func.vmap: the number of targets is the
+# same for all samples and no leaf, which torch.export.register_dataclass would make of it.
+register_pytree_node(
+    SoftMap,
+    _tensors,
+    _from_tensors,
+    serialized_type_name="torchqm.spectral.SoftMap",
+    flatten_with_keys_fn=_tensors_with_names,
+)
 
 
 def soft_fmap(

@@ -10,7 +10,7 @@ from torchqm.symmetry.algebra import (
     real_degrees,
     subgroup,
 )
-from torchqm.symmetry.basis import SymmetrizedBasis, split_by_projector, symmetrized_basis
+from torchqm.symmetry.basis import EvenOddBasis, split_by_projector, symmetrized_basis
 from torchqm.symmetry.domains import FundamentalDomains, fundamental_domains
 from torchqm.symmetry.extrinsic import (
     ExtrinsicGroup,
@@ -37,6 +37,7 @@ from torchqm.symmetry.soft import projection_matrices
 from torchqm.symmetry.split import SplitBases, split_bases, symmetrized_bases
 
 __all__ = [
+    "EvenOddBasis",
     "ExtrinsicGroup",
     "ExtrinsicReflection",
     "FundamentalDomains",
@@ -44,7 +45,6 @@ __all__ = [
     "IsotypicComponent",
     "LeftRight",
     "SplitBases",
-    "SymmetrizedBasis",
     "SymmetryGroup",
     "central_idempotents",
     "conjugacy_classes",

@@ -12,11 +12,11 @@ from torchqm.spectral.eigen import fix_signs
 from torchqm.symmetry.group import SymmetryGroup
 from torchqm.symmetry.projection import projection_matrix
 
-__all__ = ["SymmetrizedBasis", "split_by_projector", "symmetrized_basis"]
+__all__ = ["EvenOddBasis", "split_by_projector", "symmetrized_basis"]
 
 
 @dataclass(frozen=True, eq=False)
-class SymmetrizedBasis:
+class EvenOddBasis:
     """The two halves of a truncated eigenbasis: L2+ (even) and its orthogonal complement L2- (odd).
 
     Both are orthonormal in the mass of the full basis, ordered by their own eigenvalues, and together span it.
@@ -49,7 +49,7 @@ class SymmetrizedBasis:
         return SpectralBasis(self.odd_evals, self.full.evecs @ self.odd_coeffs, self.full.mass)
 
 
-def split_by_projector(basis: SpectralBasis, projector: Float[Tensor, "K K"]) -> SymmetrizedBasis:
+def split_by_projector(basis: SpectralBasis, projector: Float[Tensor, "K K"]) -> EvenOddBasis:
     """Split a basis by an approximate projector onto its symmetric part.
 
     The even half is the eigenspace of ``(P + P^T) / 2`` above one half, the odd half is the rest; inside each the
@@ -77,10 +77,10 @@ def split_by_projector(basis: SpectralBasis, projector: Float[Tensor, "K K"]) ->
         )
     even_evals, even_coeffs = _diagonalize(basis.evals, vectors[:, even])
     odd_evals, odd_coeffs = _diagonalize(basis.evals, vectors[:, ~even])
-    return SymmetrizedBasis(basis, even_coeffs, odd_coeffs, even_evals, odd_evals, weights)
+    return EvenOddBasis(basis, even_coeffs, odd_coeffs, even_evals, odd_evals, weights)
 
 
-def symmetrized_basis(basis: SpectralBasis, group: SymmetryGroup) -> SymmetrizedBasis:
+def symmetrized_basis(basis: SpectralBasis, group: SymmetryGroup) -> EvenOddBasis:
     """The bases of L2+ and L2- of a shape with a known symmetry group; see :func:`split_by_projector`.
 
     Raises:
@@ -90,7 +90,7 @@ def symmetrized_basis(basis: SpectralBasis, group: SymmetryGroup) -> Symmetrized
         raise ValueError(f"basis: has {basis.n_verts} vertices, but the group acts on {group.n_verts} vertices")
     if group.order == 1:
         identity = torch.eye(basis.k, dtype=basis.evecs.dtype)
-        return SymmetrizedBasis(
+        return EvenOddBasis(
             basis, identity, identity[:, :0], basis.evals, basis.evals[:0], torch.ones_like(basis.evals)
         )
     return split_by_projector(basis, projection_matrix(basis, group))

@@ -67,6 +67,8 @@ class Halves(NamedTuple):
 def find_halves(projection: Tensor, evals_mask: Tensor | None, rtol: float | None) -> Halves:
     """The eigenspaces of ``(P + P^T) / 2`` above one half (even) and below it (odd), and padding in neither."""
     k = projection.shape[-1]
+    if not k:
+        raise ValueError(f"projection: shape {tuple(projection.shape)} given, expected at least one function")
     place = torch.arange(k, device=projection.device)
     if evals_mask is None:
         n = torch.full((*projection.shape[:-2], 1), k, device=projection.device)

@@ -21,6 +21,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchqm.options import require_number
+
 __all__ = ["column_signs", "gap_tolerance", "invariant_eigh", "spectral_projector", "split_eigh"]
 
 
@@ -61,8 +63,7 @@ def invariant_eigh(
     References:
         Magnus 1985 for the derivatives; :mod:`torchqm.symmetry.invariant` for the losses they are exact for.
     """
-    symmetric = (matrix + matrix.mT) / 2
-    return _Eigh.apply(symmetric, scale, gap_tolerance(matrix.dtype) if rtol is None else rtol, None)
+    return _eigh(matrix, rtol, scale, None)
 
 
 def split_eigh(
@@ -92,8 +93,7 @@ def split_eigh(
         >>> int((values > 0.5).sum())
         2
     """
-    symmetric = (matrix + matrix.mT) / 2
-    return _Eigh.apply(symmetric, scale, gap_tolerance(matrix.dtype) if rtol is None else rtol, threshold)
+    return _eigh(matrix, rtol, scale, threshold)
 
 
 def spectral_projector(
@@ -133,6 +133,15 @@ def column_signs(vectors: Float[Tensor, "*B V K"]) -> Float[Tensor, "*B 1 K"]:
     size = vectors.abs()
     peak = (size >= (1 - 1e-4) * size.amax(-2, keepdim=True)).to(torch.uint8).argmax(-2, keepdim=True)
     return torch.where(torch.gather(vectors, -2, peak) < 0, -1.0, 1.0).to(vectors.dtype)
+
+
+def _eigh(matrix: Tensor, rtol: float | None, scale: Tensor | None, threshold: float | None) -> tuple[Tensor, Tensor]:
+    if rtol is None:
+        rtol = gap_tolerance(matrix.dtype)
+    else:  # below zero an eigenvalue would be apart from itself
+        require_number("rtol", rtol, least=0)
+    found: tuple[Tensor, Tensor] = _Eigh.apply((matrix + matrix.mT) / 2, scale, rtol, threshold)
+    return found
 
 
 class _Eigh(torch.autograd.Function):

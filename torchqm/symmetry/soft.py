@@ -112,12 +112,15 @@ def check_basis(evecs: Tensor, mass: Tensor, verts_mask: Tensor | None, evals_ma
     sizes = Sizes()
     sizes.bind("evecs", evecs, "... V K")
     sizes.bind("mass", mass, "... V")
+    if not sizes["K"]:
+        raise ValueError(f"evecs: shape {tuple(evecs.shape)} given, expected at least one function")
     for name, mask, dims in (("verts_mask", verts_mask, "... V"), ("evals_mask", evals_mask, "... K")):
         if mask is not None:
             sizes.bind(name, mask, dims)
             require_mask(name, mask)
     require_finite("evecs", evecs)
     require_nonnegative("mass", mass)
+    require_mask("mass > 0", mass > 0)
     return sizes
 
 

@@ -211,9 +211,9 @@ def _split(
     is_even = place < n_even
     is_odd = (place >= n_even) & (place < n)
     if k_even is None:
-        k_even = int(n_even.amax())
+        k_even = int(n_even.amax()) if n_even.numel() else 0  # of no shape at all
     if k_odd is None:
-        k_odd = int((n - n_even).amax())
+        k_odd = int((n - n_even).amax()) if n.numel() else 0
     evals_even, coeffs_even, even_mask = _lowest(values, coeffs, is_even, k_even)
     evals_odd, coeffs_odd, odd_mask = _lowest(values, coeffs, is_odd, k_odd)
     return SplitBases(

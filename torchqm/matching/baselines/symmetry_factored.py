@@ -26,7 +26,7 @@ from torchqm.matching.shape import PreparedShape
 from torchqm.matching.steps import Steps
 from torchqm.spectral.basis import SpectralBasis
 from torchqm.spectral.descriptors import wave_energies, wave_kernel_signature
-from torchqm.symmetry.basis import SymmetrizedBasis, split_by_projector
+from torchqm.symmetry.basis import EvenOddBasis, split_by_projector
 
 __all__ = ["SymmetryFactored", "correspondence_graph", "even_projector", "symmetry_factored_embedding"]
 
@@ -148,7 +148,7 @@ class SymmetryFactored:
             maps = [dense_map(refine_fmap(fmap, x, y, parameters), x, y) for fmap in fmaps]
         return make_result(self.name, x, y, torch.stack(maps), steps, labels, notes, k=k)
 
-    def split(self, shape: PreparedShape, k: int) -> SymmetrizedBasis:
+    def split(self, shape: PreparedShape, k: int) -> EvenOddBasis:
         """The first k functions of a shape, split by its own symmetry-factored embedding.
 
         Raises:
@@ -166,6 +166,6 @@ class SymmetryFactored:
         return split_by_projector(basis, even_projector(basis, ids, embedding))
 
     @staticmethod
-    def _whole(source: SymmetrizedBasis, target: SymmetrizedBasis, even: Tensor) -> Tensor:
+    def _whole(source: EvenOddBasis, target: EvenOddBasis, even: Tensor) -> Tensor:
         """The even block in the full bases."""
         return target.even_coeffs @ even @ source.even_coeffs.T
