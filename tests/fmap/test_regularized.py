@@ -152,7 +152,7 @@ def test_ridge_decides_what_nothing_else_does():
     a, b, x, _ = problem(2, ky=5)
     zero = torch.zeros_like(a)
     assert torch.equal(regularized_fmap(zero, b, x, x, ridge=1e-6), torch.zeros(2, 5, 5).double())
-    with pytest.raises(ValueError, match=r"row\(s\) \[0, 1, 2, 3, 4\] of sample 0, .* a ridge or more"):
+    with pytest.raises(ValueError, match=r"row\(s\) \[0, 1, 2, 3, 4\] of sample 0, .* a ridge \(1e-9\), more"):
         regularized_fmap(zero, b, x, x)  # the resolvent leaves the diagonal free
     # one descriptor twice: of all maps that explain it the shortest
     one = a[..., :1].expand(2, 5, 3)
@@ -269,7 +269,8 @@ def test_few_descriptors_in_single_precision(c):
 def test_what_single_precision_refuses_is_noise(c):
     """A hundred times as large: of the rows that are refused rounding leaves two digits at best; a ridge helps."""
     given = few_descriptors(100.0, c)
-    with pytest.raises(UndeterminedRowsError) as raised:
+    said = r"undetermined, to the precision of torch\.float32; give .* a ridge \(1e-3\), .* or float64"
+    with pytest.raises(UndeterminedRowsError, match=said) as raised:
         regularized_fmap(*given)
     refused = raised.value.undetermined
     exact = regularized_fmap(*few_descriptors(100.0, c, dtype=torch.float64))

@@ -29,13 +29,16 @@ class UndeterminedRowsError(ValueError):
 
     Args:
         undetermined: ``(..., Ky)`` true where a row has no unique solution.
+        dtype: in which that was found.
     """
 
-    def __init__(self, undetermined: Bool[Tensor, "*B Ky"]) -> None:
+    def __init__(self, undetermined: Bool[Tensor, "*B Ky"], dtype: torch.dtype) -> None:
         self.undetermined = undetermined.cpu()
+        single = dtype != torch.float64
         super().__init__(
-            f"the descriptors and the regulariser leave {self._rows()} of the map undetermined; "
-            "give a positive lmbda, a ridge or more independent descriptors"
+            f"the descriptors and the regulariser leave {self._rows()} of the map undetermined, to the precision of "
+            f"{dtype}; give a positive lmbda, a ridge ({'1e-3' if single else '1e-9'}), more independent descriptors"
+            + (", smaller ones (of shapes of area 1) or float64" if single else "")
         )
 
     def _rows(self) -> str:
@@ -133,7 +136,7 @@ def _rows_and_factor(
         for name, values in (("descriptors", gram), ("lmbda and eigenvalues", diagonal)):
             if not bool(torch.isfinite(values).all()):
                 raise ValueError(f"the system made of the {name} has entries that are NaN or infinite")
-        raise UndeterminedRowsError(undetermined.T.reshape(rhs.shape[:-1]))
+        raise UndeterminedRowsError(undetermined.T.reshape(rhs.shape[:-1]), gram.dtype)
     return rows.transpose(0, 1).reshape(rhs.shape).contiguous(), factor
 
 
