@@ -23,7 +23,7 @@ METHODS = ("fast_marching", "heat", "dijkstra", "exact")
 class GeodesicSolver:
     """Distances from vertices of a mesh, with everything that does not depend on the vertex done once.
 
-    The factorisation of the heat method takes as long as 40 to 80 of its solves, the set-up of fast marching as 3 to 5,
+    The factorisation of the heat method takes as long as 20 to 40 of its solves, the set-up of fast marching as 4 or 5,
     so a solver that is thrown away after a few rows costs more than they do. :meth:`kept` gives the one of the last
     call.
 
