@@ -61,8 +61,8 @@ def test_workers_share_the_queries(n, monkeypatch):
     """As many ranges as there are workers, and the same answer."""
     queries, points = noise(2000, 6), noise(40, 6, seed=1)
     ranges = []
-    look = module._look
-    monkeypatch.setattr(module, "_look", lambda one, *rest: ranges.append(len(one.queries)) or look(one, *rest))
+    improve = module._improve
+    monkeypatch.setattr(module, "_improve", lambda q, *rest: ranges.append(len(q)) or improve(q, *rest))
     before = torch.get_num_threads()
     torch.set_num_threads(n)
     try:
@@ -190,4 +190,4 @@ def test_few_candidates_are_left_on_a_real_embedding(monkeypatch):
         module, "settled", lambda q, p, rows, columns: seen.append(len(rows)) or decide(q, p, rows, columns)
     )
     nearest_rows(queries, points)
-    assert len(points) <= sum(seen) < 1.02 * len(points)
+    assert sum(seen) < 0.02 * len(points)

@@ -134,29 +134,70 @@ def _blocked(
         centre = points[:64].mean(0)
         np.subtract(queries, centre, out=longer[:, :d], casting="same_kind")
         norms = np.einsum("qd,qd->q", longer[:, :d], longer[:, :d])
+    largest, norms, starts = norms.max(), np.sqrt(norms), range(0, len(points), columns)
+    best, second = np.full(n, -np.inf, dtype=np.float32), np.full(n, -np.inf, dtype=np.float32)
+    found, farthest = np.zeros(n, dtype=np.int64), np.zeros(1, dtype=np.float32)
     # One range of queries a worker; each range is put together from blocks that stay in the cache.
     chunk = rows * max(1, -(-n // (rows * workers())))  # the same products whatever the number of workers
-    parts = []
-    for i in range(0, n, chunk):
-        mine = slice(i, i + chunk)
-        low = np.full(len(longer[mine]), -np.inf, dtype=np.float32)
-        parts.append(_Range(longer[mine], queries[mine], np.sqrt(norms[mine]), low))
-    largest = norms.max()
-    for start in range(0, len(points), columns):
-        part = points[start : start + columns]
-        block = np.empty((d + 1, len(part)), dtype=np.float32)
-        with np.errstate(over="ignore", invalid="ignore"):
-            np.subtract(part.T, centre[:, None], out=block[:d], casting="same_kind")
-            squares = np.einsum("dp,dp->p", block[:d], block[:d])
-        largest = max(largest, squares.max())
+    ranges = [slice(i, i + chunk) for i in range(0, n, chunk)]
+    for start in starts:
+        block, reach = _block(points[start : start + columns], centre)
+        largest, farthest = max(largest, reach.max() ** 2), np.maximum(farthest, reach.max())
         if not largest < _LARGE:
             break
-        block[d] = squares / -2
-        reach = np.sqrt(squares)
-        in_parallel([partial(_look, one, block, reach, part, start, rows) for one in parts])
+        in_parallel([partial(_improve, longer[r], block, start, rows, best[r], second[r], found[r]) for r in ranges])
     if not 1 / _LARGE < largest < _LARGE:
         return _rescaled(queries, points, centre, rows, columns)
-    return np.concatenate(in_parallel([partial(_decide, one, points) for one in parts]))
+    wrong = rounding_bound(norms, farthest, d)
+    doubtful = np.flatnonzero(second >= best - 2 * wrong)
+    if len(doubtful):
+        # Few, and looked at once more: that costs less than to be ready for them above.
+        part = _Range(longer[doubtful], queries[doubtful], norms[doubtful], (best - wrong)[doubtful])
+        for start in starts:
+            if len(starts) > 1:
+                block, reach = _block(points[start : start + columns], centre)
+            _look(part, block, reach, points[start : start + columns], start, rows)
+        found[doubtful] = _decide(part, points)
+    return found
+
+
+def _block(points: np.ndarray, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``(d + 1, n)`` centred points with ``- || p ||^2 / 2`` below, and their norms ``(n,)``."""
+    d = points.shape[1]
+    block = np.empty((d + 1, len(points)), dtype=np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        np.subtract(points.T, centre[:, None], out=block[:d], casting="same_kind")
+        squares = np.einsum("dp,dp->p", block[:d], block[:d])
+    block[d] = squares / -2
+    return block, np.sqrt(squares)
+
+
+def _improve(
+    queries: np.ndarray,
+    block: np.ndarray,
+    start: int,
+    rows: int,
+    best: np.ndarray,
+    second: np.ndarray,
+    found: np.ndarray,
+) -> None:
+    """Write in ``found`` the points of one block better than ``best``, and in ``second`` the next best value."""
+    products = np.empty((min(rows, len(queries)), block.shape[1]), dtype=np.float32)
+    for i in range(0, len(queries), rows):
+        part = queries[i : i + rows]
+        out, everyone, here = (
+            np.matmul(part, block, out=products[: len(part)]),
+            np.arange(len(part)),
+            slice(i, i + rows),
+        )
+        where = out.argmax(1)
+        value = out[everyone, where]
+        out[everyone, where] = -np.inf
+        np.maximum(second[here], np.minimum(best[here], value), out=second[here])
+        np.maximum(second[here], out.max(1), out=second[here])
+        better = value > best[here]
+        best[here][better] = value[better]
+        found[here][better] = where[better] + start
 
 
 def _rescaled(
@@ -183,25 +224,15 @@ def _look(part: _Range, block: np.ndarray, reach: np.ndarray, points: np.ndarray
         queries, norms, low = (v[i : i + rows] for v in (part.queries, part.norms, part.low))
         out = np.matmul(queries, block, out=products[: len(queries)])
         wrong = rounding_bound(norms, farthest, d)
-        everyone, where = np.arange(len(queries)), out.argmax(1)
-        top = out[everyone, where]
-        np.maximum(low, top - wrong, out=low)
+        np.maximum(low, out.max(1) - wrong, out=low)
         enough = low - wrong
-        out[everyone, where] = -_LARGE
-        doubtful = np.flatnonzero(out.max(1) >= enough)
-        part.add(everyone + i, where + start, top + wrong, top >= enough)
-        if not len(doubtful):
-            continue
-        some = out if len(doubtful) == len(out) else out[doubtful]
-        others = np.flatnonzero(some >= enough[doubtful, None])  # twice as quick as nonzero of a matrix
-        if len(others) > _MANY * len(doubtful):
-            row = doubtful
-            column = scipy.spatial.distance.cdist(part.given[row + i], points, "sqeuclidean").argmin(1)
-            value = np.where(column == where[row], top[row], out[row, column])
+        good = np.flatnonzero(out >= enough[:, None])  # twice as quick as nonzero of a matrix
+        if len(good) > _MANY * len(queries):
+            row = np.arange(len(queries))
+            column = scipy.spatial.distance.cdist(part.given[i : i + rows], points, "sqeuclidean").argmin(1)
         else:
-            row, column = np.divmod(others, out.shape[1])
-            row = doubtful[row]
-            value = out[row, column]
+            row, column = np.divmod(good, out.shape[1])
+        value = out[row, column]
         own = rounding_bound(norms[row], reach[column], d)
         np.maximum.at(low, row, value - own)
         part.add(row + i, column + start, value + own, value + own >= low[row])
