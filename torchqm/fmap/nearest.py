@@ -149,6 +149,9 @@ def _blocked(
     if not 1 / _LARGE < largest < _LARGE:
         return _rescaled(queries, points, centre, rows, columns)
     wrong = rounding_bound(norms, farthest, d)
+    # A point as near as the best one, at a distance r, is no longer than |q| + r: mostly less than the longest of all.
+    square = np.maximum(norms**2 * np.float32(1.0001) - 2 * best + 2 * wrong, 0)
+    wrong = rounding_bound(norms, np.minimum(farthest, (norms + np.sqrt(square)) * np.float32(1.0001)), d)
     doubtful = np.flatnonzero(second >= best - 2 * wrong)
     if len(doubtful):
         # Few, and looked at once more: that costs less than to be ready for them above.
