@@ -1,8 +1,9 @@
-"""Seconds and memory: eigenpairs, a whole pair of meshes, and how both grow from 1,000 vertices to a million.
+"""Seconds and memory: eigenpairs, a whole pair of meshes, how both grow to a million vertices, and geodesics.
 
     python benchmarks/speed.py eigenpairs [--scb ROOT] [--sizes 5000 28000 52000] [--k 100 200 300] [--repeats 5]
     python benchmarks/speed.py pair       [--scb ROOT] [--repeats 5]
     python benchmarks/speed.py growth     [--sizes 1000 4000 ...]
+    python benchmarks/speed.py geodesics  [--scb ROOT] [--sizes 1000 28000 52000 250000] [--repeats 5]
 
 Peers run in the same process and take turns with torchqm; reported are medians and ratios. Peak memory is that of a
 process of its own for each. With --scb the meshes of 28k and 52k vertices are TOSCA's cat1 and michael1, else built-in
@@ -13,6 +14,7 @@ import argparse
 from pathlib import Path
 
 import speed_eigen
+import speed_geodesic
 import speed_growth
 import speed_match
 import torch
@@ -20,7 +22,7 @@ import torch
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("eigenpairs", "pair", "growth"))
+    parser.add_argument("part", choices=("eigenpairs", "pair", "growth", "geodesics"))
     parser.add_argument("--scb", type=Path, help="root of TOSCA as SCB ships it")
     parser.add_argument("--sizes", type=int, nargs="+")
     parser.add_argument("--k", type=int, nargs="+", default=[100, 200, 300])
@@ -32,6 +34,8 @@ def main() -> None:
         speed_eigen.measure(args.sizes or [5000, 28000, 52000], args.k, args.repeats, args.scb)
     elif args.part == "pair":
         speed_match.measure(args.repeats, args.scb)
+    elif args.part == "geodesics":
+        speed_geodesic.measure(args.sizes or [1000, 28000, 52000, 250000], args.repeats, args.scb)
     else:
         speed_growth.measure(args.sizes or [1000, 4000, 16000, 64000, 250000, 1000000])
 

@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 from references import shapes
 
 import torchqm.geometry.geodesic
+from torchqm.evaluate import TruthDistances
 from torchqm.evaluate.distances import distance_rows, pair_distances, solver_used
+from torchqm.evaluate.label_free import bijectivity
+from torchqm.geometry import geodesic_solver
 from torchqm.geometry.geodesic import distances
 from torchqm.geometry.mesh import Mesh
 
@@ -89,6 +92,22 @@ def test_no_more_than_a_chunk_of_rows_is_asked_for_at_a_time(monkeypatch: pytest
     assert asked == [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9], [10, 11]]
     pair_distances(FLAT, everywhere, everywhere, "dijkstra")  # nothing to solve
     assert len(asked) == 3
+
+
+@pytest.mark.parametrize("method", ["heat", "fast_marching"])
+def test_chunks_measures_and_the_name_of_the_solver_share_one_set_up(
+    method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_up, made = geodesic_solver._SET_UP[method], []
+    monkeypatch.setitem(geodesic_solver._SET_UP, method, lambda surface: made.append(1) or set_up(surface))
+    monkeypatch.setattr("torchqm.evaluate.distances._CHUNK_BYTES", 2 * 8 * 12)
+    mesh = FLAT.moved(FLAT.verts.clone())
+    everywhere = torch.arange(12)
+    pair_distances(mesh, everywhere, everywhere.flip(0), method)  # six chunks
+    truth = TruthDistances.build(mesh, torch.tensor([0, 3, 7]), method)
+    bijectivity(mesh, everywhere.flip(0), everywhere, method=method)
+    assert truth.method == method
+    assert len(made) == 1
 
 
 def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,13 +1,13 @@
 """torchqm.fmap.threads: one thread inside, what was set before outside, also after an error."""
 
 from functools import partial
-from threading import Barrier, get_ident
+from threading import Barrier, Event, Thread, get_ident
 
 import pytest
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from torchqm.fmap.threads import in_parallel, in_shares, one_thread, workers
+from torchqm.fmap.threads import in_parallel, in_shares, one_thread, threads_as_before, workers
 
 
 @pytest.fixture(autouse=True)
@@ -111,3 +111,59 @@ def test_one_share_is_run_here():
     seen = []
     in_shares(lambda items: seen.append((list(items), get_ident())), range(3), 1)
     assert seen == [([0, 1, 2], get_ident())]
+
+
+def test_others_have_the_threads_that_were_there_before():
+    outside = blas()
+    with one_thread():
+        with threads_as_before():
+            assert (torch.get_num_threads(), blas(), workers()) == (2, outside, 1)
+            with one_thread():  # what others call may be this package again
+                assert (torch.get_num_threads(), set(blas()), workers()) == (1, {1}, 2)
+            assert (torch.get_num_threads(), blas()) == (2, outside)
+        assert (torch.get_num_threads(), set(blas()), workers()) == (1, {1}, 2)
+    assert (torch.get_num_threads(), blas()) == (2, outside)
+    with threads_as_before():
+        assert (torch.get_num_threads(), blas()) == (2, outside)
+    with pytest.raises(KeyError), one_thread(), threads_as_before():
+        raise KeyError
+    assert (torch.get_num_threads(), blas(), workers()) == (2, outside, 1)
+
+
+def test_two_threads_of_python_inside_at_the_same_time():
+    """The first to come is the first to go: the second still has one, and the last leaves what the first has found."""
+    outside, entered, leave, seen = blas(), Event(), Event(), []
+
+    def other():
+        torch.set_num_threads(2)
+        with one_thread():
+            entered.set()
+            leave.wait(20)
+            seen.append(set(blas()))
+        seen.append(torch.get_num_threads())
+
+    thread = Thread(target=other)
+    with one_thread():
+        thread.start()
+        assert entered.wait(20)
+    leave.set()
+    thread.join(20)
+    assert seen == [{1}, 2]
+    assert blas() == outside
+    assert torch.get_num_threads() == 2
+
+
+def test_also_in_a_thread_that_is_not_the_main_one():
+    seen = []
+
+    def inside():
+        with one_thread():
+            seen.append((torch.get_num_threads(), set(blas())))
+        seen.append((torch.get_num_threads(), set(blas())))
+
+    thread = Thread(target=inside)
+    thread.start()
+    thread.join(20)
+    assert seen == [(1, {1}), (2, set(blas()))]
+    with threadpool_limits(1, "blas"):  # the right to set it is not taken from others for good
+        assert set(blas()) == {1}

@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.sparse.csgraph import dijkstra
 
+import torchqm.geometry.sampling as module
 from torchqm.geometry import Mesh, area_samples, edge_graph, farthest_points
 
 
@@ -74,6 +77,81 @@ def test_farthest_points_are_the_greedy_choice(method):
     for k in range(1, 40):
         nearest = distance[:k].min(0)
         assert nearest[ids[k]] == pytest.approx(nearest.max(), rel=1e-9)
+
+
+def by_whole_rows(mesh, n, start):
+    """The twin: all distances from every point, and their least."""
+    rows = dijkstra(edge_graph(mesh))
+    nearest, out = np.where(mesh.referenced.numpy(), np.inf, -1.0), []
+    for _ in range(n):
+        out.append(start)
+        nearest = np.minimum(nearest, rows[start])
+        nearest[out] = -1.0
+        start = int(nearest.argmax())
+    return out
+
+
+def islands():
+    """Two strips of different triangles far apart."""
+    strip = uneven()
+    return Mesh(torch.cat([strip.verts, strip.verts + 50]), torch.cat([strip.faces, strip.faces + strip.n_verts]))
+
+
+def rough(seed):
+    """A ball with noise, so that edges differ and no two paths are equally long, and triangles left out."""
+    noise = torch.Generator().manual_seed(seed)
+    ball = sphere()
+    verts = ball.verts * (0.3 + torch.rand(ball.n_verts, 1, generator=noise, dtype=torch.float64))
+    return Mesh(verts, ball.faces[torch.rand(ball.n_faces, generator=noise) > 0.2])
+
+
+@pytest.mark.parametrize("make", [sphere, uneven, islands, lambda: rough(0)])
+def test_fronts_that_stop_give_the_points_of_all_distances(make, monkeypatch):
+    mesh = make()
+    mesh = mesh.moved((mesh.verts - mesh.verts[:1]) / (mesh.verts - mesh.verts[:1]).abs().max())  # as it is done inside
+    n = min(80, int(mesh.referenced.sum()))
+    for whole in (0, 3, module._WHOLE, n):
+        monkeypatch.setattr(module, "_WHOLE", whole)
+        assert farthest_points(mesh, n, start=7).tolist() == by_whole_rows(mesh, n, 7)
+
+
+@given(st.integers(0, 10_000), st.integers(0, 3))
+@settings(max_examples=15, deadline=None)
+def test_a_front_leaves_the_least_distances(seed, taken):
+    """Bit for bit, whatever was there before, and it goes no further than it has to."""
+    mesh = rough(seed)
+    graph = edge_graph(mesh)
+    points = np.random.default_rng(seed).choice(mesh.n_verts, taken + 1, replace=False)
+    rows = dijkstra(graph, indices=points)
+    nearest = np.full(mesh.n_verts, np.inf)
+    for point in points:
+        module._lower(nearest, graph, int(point))
+    wanted = rows.min(0)
+    wanted[points] = -1.0
+    assert np.array_equal(nearest, wanted)
+
+
+def test_a_front_reads_no_more_than_its_own_part():
+    """Edges of which one end is not nearer to the new point do not go on."""
+    mesh = sphere(4)
+    graph = edge_graph(mesh)
+    nearest = np.full(mesh.n_verts, np.inf)
+    points = farthest_points(mesh, 200).tolist()
+    for point in points:
+        module._lower(nearest, graph, point)
+    before = nearest.copy()
+    new = int(nearest.argmax())
+    read = []
+
+    class Counted(np.ndarray):
+        def __getitem__(self, key):
+            read.append(np.size(key))
+            return np.asarray(self)[key]
+
+    graph.data = graph.data.view(Counted)
+    module._lower(nearest, graph, new)
+    changed = int((nearest != before).sum())
+    assert 0 < sum(read) < 30 * changed < graph.nnz / 4
 
 
 @pytest.mark.parametrize("method", ["dijkstra", "euclidean"])

@@ -66,6 +66,25 @@ def test_every_method_takes_them(exact, method):
     assert "descriptors" in found.seconds
 
 
+def test_they_are_made_with_the_threads_of_the_caller(exact):
+    """A network on one thread would take as many times as long as there are cores; the rest of a match has one."""
+    values, seen, before = smooth(exact), [], torch.get_num_threads()
+
+    def describe(shape):
+        seen.append(torch.get_num_threads())
+        return values[len(seen) - 1]
+
+    torch.set_num_threads(3)
+    try:
+        Collection(parameters=PLAIN, descriptors=describe).match(
+            exact.x, exact.y, exact.group_y.maps, exact.group_x.maps
+        )
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [3, 3]
+
+
 def test_semi_quotient_solves_from_them(exact):
     found = match_semi_quotient(exact.x, exact.y, exact.group_y, PLAIN.changed(icp_steps=0), smooth(exact))
     wanted = p2p_to_fmap(exact.p2p_yx, exact.x.basis.truncate(FAST.k), found.target.even)

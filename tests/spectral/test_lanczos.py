@@ -5,6 +5,7 @@ import pytest
 import scipy.sparse as sp
 import torch
 from references.shapes import icosphere
+from torch.overrides import TorchFunctionMode
 
 import torchqm.spectral.lanczos as module
 from torchqm.data.synthetic import creature
@@ -160,3 +161,69 @@ def test_a_matrix_without_factor_is_an_error():
     matrix = sp.csc_array(sp.diags_array(np.r_[-5.0, np.arange(1.0, 500)]))
     with pytest.raises(LanczosError, match="no Cholesky factor"):
         lowest_eigenpairs(matrix, 10, 1e-8, 10.0)
+
+
+class TwoPlaces(TorchFunctionMode):
+    """A second device, played on the CPU: its tensors meet no others, and NumPy only after ``.cpu()``."""
+
+    def __init__(self):
+        super().__init__()
+        self.moved, self.there = 0, set()
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        kwargs, name = kwargs or {}, getattr(func, "__name__", "")
+        tensors = [a for a in (*args, *kwargs.values()) if isinstance(a, torch.Tensor) and a.ndim]
+        places = {hasattr(a, "there") for a in tensors}
+        if len(places) > 1:
+            raise TypeError(f"{name}: tensors of two devices")
+        if name == "numpy" and places == {True}:
+            raise TypeError("numpy: a tensor of the other device")
+        found = func(*args, **kwargs)
+        if isinstance(found, torch.Tensor) and name != "from_numpy":
+            if name == "cpu":
+                return found.detach().clone()  # no longer marked
+            if name == "to" and places == {False}:
+                self.moved += 1
+                found = found.clone()
+            if name == "to" or kwargs.get("device") is not None or places == {True}:
+                found.there = True
+        return found
+
+
+def test_long_vectors_stay_on_the_device(mirror_blob, monkeypatch):
+    matrix = scaled(mirror_blob.mesh)
+    wanted = lowest_eigenpairs(matrix, 40, 1e-9, 4 * np.pi * 40)
+    solver = module._solver
+
+    def on_device(matrix, shift, device):
+        solve = solver(matrix, shift, device)
+
+        def there(rows):
+            assert hasattr(rows, "there")
+            return solve(rows)
+
+        return there
+
+    monkeypatch.setattr(module, "_solver", on_device)
+    with TwoPlaces() as places:
+        found = lowest_eigenpairs(matrix, 40, 1e-9, 4 * np.pi * 40)
+    assert places.moved > 10
+    assert not hasattr(found.evecs, "there")
+    assert np.array_equal(found.evals, wanted.evals)
+    assert torch.equal(found.evecs, wanted.evecs)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_the_basis_of_a_gpu_is_that_of_the_cpu(mirror_blob):
+    operator = laplacian(mirror_blob.mesh)
+    there, here = (eigenbasis(operator, 40, solver="lanczos", device=device) for device in ("cuda", "cpu"))
+    assert there.evecs.device.type == "cpu"
+    torch.testing.assert_close(there.evals, here.evals, rtol=1e-9, atol=1e-9)
+    assert float(relative_residuals(operator, there).max()) < 1e-8
+
+
+@pytest.mark.parametrize(("device", "fault"), [("tpu", "allowed are 'cpu' and 'cuda'"), ("cuda:7", "sees no CUDA")])
+def test_a_device_that_is_not_there_is_named(mirror_blob, device, fault, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match=f"device: '{device}' given, .*{fault}"):
+        eigenbasis(laplacian(mirror_blob.mesh), 12, device=device)

@@ -20,6 +20,16 @@ def test_equals_the_split_descriptors_times_the_weights(s):
         torch.testing.assert_close(splitting.coefficients(v, w), w.T @ full, atol=1e-11, rtol=1e-11)
 
 
+@pytest.mark.parametrize("s", [5, 9, 10, 11, 15, 24])
+def test_single_precision_keeps_its_digits(s):
+    """Products of the first bump are of no use where it is below the smallest number."""
+    values, weights = noise(900, 3).float(), noise(900, 4, seed=2).float()
+    found = Splitting.of([values], s).coefficients(values, weights)
+    assert found.dtype == torch.float32
+    wanted = weights.double().T @ dense.split_descriptors([values.double()], s)[0]
+    torch.testing.assert_close(found.double(), wanted, atol=2e-4, rtol=0)
+
+
 def test_a_constant_descriptor_is_finite():
     flat = torch.full((10, 2), 3.0, dtype=torch.float64)
     assert bool(torch.isfinite(Splitting.of([flat], 5).coefficients(flat, noise(10, 2))).all())

@@ -13,14 +13,13 @@ import torch
 from jaxtyping import Int, Shaped
 from torch import Tensor
 
-from torchqm.geometry.check import inspect_mesh, orient_faces
 from torchqm.geometry.files import write_whole
 from torchqm.geometry.mesh import Mesh
 
 __all__ = ["distance_rows", "pair_distances", "solver_used"]
 
 _CACHE_VERSION = 1
-_CHUNK_BYTES = 2**28  # of the solver's float64 rows at a time (it sets up anew for each chunk)
+_CHUNK_BYTES = 2**28  # of the solver's float64 rows at a time
 
 
 def solver_used(mesh: Mesh, method: str = "fast_marching") -> str:
@@ -34,10 +33,9 @@ def solver_used(mesh: Mesh, method: str = "fast_marching") -> str:
         >>> solver_used(fan), solver_used(fan, "dijkstra")
         ('heat', 'dijkstra')
     """
-    if method != "fast_marching":
-        return method
-    report = inspect_mesh(mesh)
-    return method if report.manifold and (report.oriented or orient_faces(mesh) is not None) else "heat"
+    from torchqm.geometry.geodesic_solver import GeodesicSolver
+
+    return GeodesicSolver.kept(mesh, method).used
 
 
 def distance_rows(

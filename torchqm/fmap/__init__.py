@@ -9,7 +9,7 @@ from torchqm.fmap.energy import (
     orthogonality_energy,
 )
 from torchqm.fmap.fmap_losses import bijectivity_energy, surfmnet_losses
-from torchqm.fmap.nearest import SurfaceSearch, nearest_rows
+from torchqm.fmap.nearest import nearest_rows
 from torchqm.fmap.orbit_consistency import inner_pairings, orbit_consistency_fmap, orbit_consistency_points
 from torchqm.fmap.orbit_loss import (
     assignment_orbit_loss,
@@ -31,6 +31,7 @@ from torchqm.fmap.refine import (
 from torchqm.fmap.regularized import descriptor_coefficients, regularized_blocks, regularized_fmap
 from torchqm.fmap.soft import feature_neighbours, soft_assignment, soft_map
 from torchqm.fmap.solve import solve_fmap
+from torchqm.fmap.surface_search import SurfaceSearch
 from torchqm.fmap.two_way import Places, growing_pairs, two_way_upsample
 from torchqm.fmap.unrolled import soft_icp, soft_upsample
 

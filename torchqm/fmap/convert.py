@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchqm.fmap.nearest import SurfaceSearch, nearest_rows
+from torchqm.fmap.nearest import nearest_rows
+from torchqm.fmap.surface_search import SurfaceSearch
 from torchqm.fmap.threads import in_parallel, workers
 from torchqm.spectral.basis import SpectralBasis
 

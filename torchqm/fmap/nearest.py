@@ -1,6 +1,6 @@
-"""Exact nearest neighbours between two sets of spectral coordinates, in bounded memory."""
+"""Nearest neighbours between two sets of spectral coordinates, in bounded memory: float32 products, float64 answers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -11,26 +11,27 @@ from torch import Tensor
 
 from torchqm.fmap.threads import in_parallel, workers
 
-__all__ = ["SurfaceSearch", "nearest_rows"]
+__all__ = ["nearest_rows", "rounding_bound", "settled"]
 
-_SMALL = 200_000  # distance entries below which one dense product is as quick as a blocked one
-_GROUPS = 16  # anchors of a block in the second stage of a search on a surface
-_ROWS, _COLUMNS = 256, 8192  # of a block of distances: 8 MiB for each worker, whatever the number of points
+_ROWS, _COLUMNS = 256, 8192  # of a block of products: 8 MiB for each worker, whatever the number of points
+_MANY = 256  # candidates for each query of a block from which on all its distances are computed
+_PAIRS = 4096  # distances computed at a time
+_LARGE = 2.0**60  # squares between 1 / _LARGE and _LARGE keep their digits in single precision
 
 
 def nearest_rows(queries: Float[Tensor, "Q D"], points: Float[Tensor, "P D"]) -> Int[Tensor, " Q"]:
-    """For each query the index of the nearest point: ``argmin_p || q - p ||``.
+    """For each query the index of the nearest point: ``argmin_p || q - p ||``, of equally near ones the first.
 
-    Distances are computed in float32, in blocks: the Q x P matrix never exists. Small problems are solved in the
-    precision they come in. Where several points are equally near, one of them comes back. Blocked products are as
-    quick as faiss' flat index at 200 coordinates (2,000 x 5,000), and quicker at fewer.
+    Products in float32, in blocks (the Q x P matrix never exists), leave the points that the rounding of these products
+    (:func:`rounding_bound`) does not rule out: mostly one. Where there are more, ``sum (q - p)^2`` in float64 decides.
+    So the answer is that of all distances in float64, at the price of single precision.
 
     Raises:
         ValueError: the coordinates have different dimensions, there are no points, or some are not finite.
 
     Example:
-        >>> nearest_rows(torch.tensor([[0.9]]), torch.tensor([[0.0], [1.0]])).tolist()
-        [1]
+        >>> nearest_rows(torch.tensor([[0.9], [0.5]]), torch.tensor([[0.0], [1.0], [0.0]])).tolist()
+        [1, 0]
     """
     if queries.shape[1] != points.shape[1]:
         raise ValueError(f"queries have {queries.shape[1]} coordinates, points have {points.shape[1]}")
@@ -38,12 +39,86 @@ def nearest_rows(queries: Float[Tensor, "Q D"], points: Float[Tensor, "P D"]) ->
         raise ValueError("points: there are none to choose from")
     if not bool(torch.isfinite(queries.sum() + points.sum())):  # NaN and infinities survive a sum
         raise ValueError("queries and points must be finite; a spectral coordinate is NaN or infinite")
-    if queries.shape[0] * points.shape[0] <= _SMALL:
-        centre = points.mean(0)  # see _blocked
-        queries, points = queries - centre, points - centre
-        # || q - p ||^2 without || q ||^2, which is the same for all points
-        return torch.argmax(queries @ points.T - points.square().sum(1) / 2, dim=1)
     return torch.from_numpy(_blocked(queries.detach().numpy(), points.detach().numpy()))
+
+
+def rounding_bound(queries: np.ndarray, points: np.ndarray, d: int) -> np.ndarray:
+    """How far ``q . p - || p ||^2 / 2`` in float32 may be from the truth, whatever the order of its sum.
+
+    ``c |p| (|q| + |p|) + 2^-52 (d + 3) (|q| + |p|)^2`` with ``c = 1.1 n u / (1 - n u)``, ``u = 2^-24``, ``n = d + 8``:
+    d products and their sum, both vectors rounded to float32 first, the norm rounded like a product, two comparisons.
+    The second term is the rounding of distances in float64, which the answer is compared by in the end.
+
+    Args:
+        queries: norms.
+        points: norms, of a shape that fits.
+        d: number of coordinates.
+
+    References:
+        N. Higham, "Accuracy and Stability of Numerical Algorithms", 2002, section 3.1.
+    """
+    n = (d + 8) * 2.0**-24
+    both = queries + points
+    tiny = (d + 2) * 2.0**-90  # of products that are below the range of float32
+    return (1.1 * n / (1 - n)) * points * both + ((d + 3) * 2.0**-52) * both**2 + tiny
+
+
+def settled(
+    queries: Shaped[np.ndarray, "Q D"],
+    points: Shaped[np.ndarray, "P D"],
+    rows: Int[np.ndarray, " N"],
+    columns: Int[np.ndarray, " N"],
+) -> Int[np.ndarray, " Q"]:
+    """For each query the nearest of its candidates by ``sum (q - p)^2`` in float64; of equally near ones the first.
+
+    Args:
+        queries: all of them.
+        points: all of them.
+        rows: queries, each at least once.
+        columns: for each of these a candidate.
+    """
+    out = np.empty(len(queries), dtype=np.int64)
+    out[rows] = columns
+    doubtful = np.flatnonzero((np.bincount(rows, minlength=len(queries)) > 1)[rows])
+    if len(doubtful):
+        rows, columns = rows[doubtful], columns[doubtful]
+        far = np.empty(len(rows))
+        for i in range(0, len(rows), _PAIRS):
+            some = slice(i, i + _PAIRS)
+            apart = np.subtract(queries[rows[some]], points[columns[some]], dtype=np.float64)
+            far[some] = np.einsum("nd,nd->n", apart, apart)
+        order = np.lexsort((columns, far, rows))
+        first = order[np.flatnonzero(np.diff(rows[order], prepend=-1))]
+        out[rows[first]] = columns[first]
+    return out
+
+
+@dataclass(eq=False)
+class _Range:
+    """Some of the queries, one after the other, and their candidates so far.
+
+    Args:
+        queries: ``(n, d + 1)`` centred, in float32, with a 1 at the end.
+        given: ``(n, d)`` as they came.
+        norms: ``(n,)``
+        low: ``(n,)`` what the largest product is at least.
+        rows: of the candidates, one array a block.
+        columns: likewise.
+        high: what their product is at most.
+    """
+
+    queries: np.ndarray
+    given: np.ndarray
+    norms: np.ndarray
+    low: np.ndarray
+    rows: list[np.ndarray] = field(default_factory=list)
+    columns: list[np.ndarray] = field(default_factory=list)
+    high: list[np.ndarray] = field(default_factory=list)
+
+    def add(self, rows: np.ndarray, columns: np.ndarray, high: np.ndarray, good: np.ndarray) -> None:
+        """Candidates, where they are good."""
+        for kept, new in zip((self.rows, self.columns, self.high), (rows, columns, high), strict=True):
+            kept.append(new if good.all() else new[good])
 
 
 def _blocked(
@@ -51,159 +126,122 @@ def _blocked(
 ) -> Shaped[np.ndarray, " Q"]:
     """The largest ``q . p - || p ||^2 / 2`` of each query, the second term as one coordinate more of the product."""
     n, d = queries.shape
+    if not n:
+        return np.zeros(0, dtype=np.int64)
     # What all points have in common is taken off before it costs digits (heat kernel signatures are nearly constant).
-    centre = points[:64].mean(0)
     longer = np.ones((n, d + 1), dtype=np.float32)
-    np.subtract(queries, centre, out=longer[:, :d], casting="same_kind")
-    best, found = np.full(n, -np.inf, dtype=np.float32), np.zeros(n, dtype=np.int64)
-    for start in range(0, len(points), columns):
-        part = points[start : start + columns]
-        block = np.empty((d + 1, len(part)), dtype=np.float32)
-        np.subtract(part.T, centre[:, None], out=block[:d], casting="same_kind")
-        block[d] = np.einsum("dp,dp->p", block[:d], block[:d]) / -2
-        # One range of queries a worker; each range is put together from blocks that stay in the cache.
-        chunk = rows * max(1, -(-n // (rows * workers())))  # the same products whatever the number of workers
-        in_parallel(
-            [
-                partial(_improve, longer[i : i + chunk], block, start, rows, best[i : i + chunk], found[i : i + chunk])
-                for i in range(0, n, chunk)
-            ]
-        )
+    with np.errstate(over="ignore", invalid="ignore"):
+        centre = points[:64].mean(0)
+        np.subtract(queries, centre, out=longer[:, :d], casting="same_kind")
+        norms = np.einsum("qd,qd->q", longer[:, :d], longer[:, :d])
+    largest, norms, starts = norms.max(), np.sqrt(norms), range(0, len(points), columns)
+    best, second = np.full(n, -np.inf, dtype=np.float32), np.full(n, -np.inf, dtype=np.float32)
+    found, farthest = np.zeros(n, dtype=np.int64), np.zeros(1, dtype=np.float32)
+    # One range of queries a worker; each range is put together from blocks that stay in the cache.
+    chunk = rows * max(1, -(-n // (rows * workers())))  # the same products whatever the number of workers
+    ranges = [slice(i, i + chunk) for i in range(0, n, chunk)]
+    for start in starts:
+        block, reach = _block(points[start : start + columns], centre)
+        largest, farthest = max(largest, reach.max() ** 2), np.maximum(farthest, reach.max())
+        if not largest < _LARGE:
+            break
+        in_parallel([partial(_improve, longer[r], block, start, rows, best[r], second[r], found[r]) for r in ranges])
+    if not 1 / _LARGE < largest < _LARGE:
+        return _rescaled(queries, points, centre, rows, columns)
+    wrong = rounding_bound(norms, farthest, d)
+    # A point as near as the best one, at a distance r, is no longer than |q| + r: mostly less than the longest of all.
+    square = np.maximum(norms**2 * np.float32(1.0001) - 2 * best + 2 * wrong, 0)
+    wrong = rounding_bound(norms, np.minimum(farthest, (norms + np.sqrt(square)) * np.float32(1.0001)), d)
+    doubtful = np.flatnonzero(second >= best - 2 * wrong)
+    if len(doubtful):
+        # Few, and looked at once more: that costs less than to be ready for them above.
+        part = _Range(longer[doubtful], queries[doubtful], norms[doubtful], (best - wrong)[doubtful])
+        for start in starts:
+            if len(starts) > 1:
+                block, reach = _block(points[start : start + columns], centre)
+            _look(part, block, reach, points[start : start + columns], start, rows)
+        found[doubtful] = _decide(part, points)
     return found
 
 
+def _block(points: np.ndarray, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``(d + 1, n)`` centred points with ``- || p ||^2 / 2`` below, and their norms ``(n,)``."""
+    d = points.shape[1]
+    block = np.empty((d + 1, len(points)), dtype=np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        np.subtract(points.T, centre[:, None], out=block[:d], casting="same_kind")
+        squares = np.einsum("dp,dp->p", block[:d], block[:d])
+    block[d] = squares / -2
+    return block, np.sqrt(squares)
+
+
 def _improve(
-    queries: np.ndarray, block: np.ndarray, start: int, rows: int, best: np.ndarray, found: np.ndarray
+    queries: np.ndarray,
+    block: np.ndarray,
+    start: int,
+    rows: int,
+    best: np.ndarray,
+    second: np.ndarray,
+    found: np.ndarray,
 ) -> None:
-    """Write in ``found`` the points of one block that are better than ``best``."""
+    """Write in ``found`` the points of one block better than ``best``, and in ``second`` the next best value."""
     products = np.empty((min(rows, len(queries)), block.shape[1]), dtype=np.float32)
     for i in range(0, len(queries), rows):
         part = queries[i : i + rows]
-        out = np.matmul(part, block, out=products[: len(part)])
-        where = out.argmax(1)
-        value = out[np.arange(len(part)), where]
-        better = value > best[i : i + rows]
-        best[i : i + rows][better] = value[better]
-        found[i : i + rows][better] = where[better] + start
-
-
-@dataclass(frozen=True, eq=False)
-class SurfaceSearch:
-    """Nearest vertices of a surface in two stages: among anchor vertices first, then around the best anchor.
-
-    Spectral coordinates are smooth on the surface, so the nearest vertex lies near the nearest anchor. The second stage
-    looks at the vertices closest to that in space, and nowhere else: a search among V vertices costs little more than
-    one among the anchors. Queries that are themselves the vertices of a surface need not even be compared with all
-    anchors: the partner of a vertex lies near those of the anchors around it. The search can miss
-    (``benchmarks/speed_pair.py`` prints how often, and by how far).
-
-    Args:
-        anchors: ``(A,)`` vertex ids, spread over the surface.
-        around: ``(A, m)`` for each anchor the vertices closest to it in space, itself first.
-        close: ``(V, n)`` for each vertex its closest anchors in space, as indices into ``anchors``.
-
-    Example:
-        >>> line = torch.arange(10.0, dtype=torch.float64)[:, None]
-        >>> search = SurfaceSearch.build(line, torch.tensor([0, 3, 6, 9]), m=3)
-        >>> search.nearest(line + 0.2, line).tolist()
-        [0, 1, 2, 3, 4, 5, 6, 7, 8, 9]
-    """
-
-    anchors: Int[Tensor, " A"]
-    around: Int[Tensor, "A m"]
-    close: Int[Tensor, "V n"]
-
-    @classmethod
-    def build(cls, verts: Float[Tensor, "V D"], anchors: Int[Tensor, " A"], m: int = 96, n: int = 8) -> "SurfaceSearch":
-        """Prepare the search on the vertices of a surface.
-
-        Args:
-            verts: ``(V, 3)`` positions; vertices that no face uses must be left out by the choice of ``anchors`` and
-                lie nowhere near the surface, or be passed as far away.
-            anchors: ids of the first stage.
-            m: vertices looked at around each anchor.
-            n: anchors near a vertex whose partners are tried for it.
-        """
-        everything, chosen = verts.numpy(), verts[anchors].numpy()
-        tree, workers = scipy.spatial.cKDTree, torch.get_num_threads()
-        around = tree(everything).query(chosen, k=min(m, len(everything)), workers=workers)[1]
-        close = tree(chosen).query(everything, k=min(n, len(chosen)), workers=workers)[1]
-        return cls(
-            anchors,
-            torch.from_numpy(around.reshape(len(chosen), -1)),
-            torch.from_numpy(close.reshape(len(everything), -1)),
+        out, everyone, here = (
+            np.matmul(part, block, out=products[: len(part)]),
+            np.arange(len(part)),
+            slice(i, i + rows),
         )
-
-    def nearest(
-        self, queries: Float[Tensor, "Q K"], points: Float[Tensor, "V K"], guide: "SurfaceSearch | None" = None
-    ) -> Int[Tensor, " Q"]:
-        """For each query the nearest of the points around its nearest anchor.
-
-        Args:
-            queries: coordinates looked for.
-            points: coordinates of all V vertices.
-            guide: the search of the surface whose vertices the queries are, in their order: only the queries at its
-                anchors are compared with all anchors here, the others with the partners of the anchors close to them.
-
-        Raises:
-            ValueError: the guide is of a surface with another number of vertices.
-        """
-        queries32, points32 = _float32(queries), _float32(points)
-        anchor_points = points32[self.anchors.numpy()]
-        if guide is None:
-            stage = nearest_rows(torch.from_numpy(queries32), torch.from_numpy(anchor_points)).numpy()
-        else:
-            if guide.close.shape[0] != len(queries32):
-                raise ValueError(f"guide: has {guide.close.shape[0]} vertices, but there are {len(queries32)} queries")
-            at_anchors = torch.from_numpy(queries32[guide.anchors.numpy()])
-            partners = nearest_rows(at_anchors, torch.from_numpy(anchor_points)).numpy()[guide.close.numpy()]
-            size = max(1, -(-len(partners) // workers()))
-            some = [slice(i, i + size) for i in range(0, len(partners), size)]
-            tasks = [partial(_closest, queries32[rows], anchor_points, partners[rows]) for rows in some]
-            stage = partners[np.arange(len(partners)), np.concatenate(in_parallel(tasks))]
-        return torch.from_numpy(_around(queries32, points32, stage, self.around.numpy()))
+        where = out.argmax(1)
+        value = out[everyone, where]
+        out[everyone, where] = -np.inf
+        np.maximum(second[here], np.minimum(best[here], value), out=second[here])
+        np.maximum(second[here], out.max(1), out=second[here])
+        better = value > best[here]
+        best[here][better] = value[better]
+        found[here][better] = where[better] + start
 
 
-def _around(
-    queries: Shaped[np.ndarray, "Q K"],
-    points: Shaped[np.ndarray, "V K"],
-    stage: Shaped[np.ndarray, " Q"],
-    around: Shaped[np.ndarray, "A m"],
+def _rescaled(
+    queries: np.ndarray, points: np.ndarray, centre: np.ndarray, rows: int, columns: int
 ) -> Shaped[np.ndarray, " Q"]:
-    """For each query the nearest of the points around its anchor."""
-    half = (points**2).sum(1) / 2
-    out = np.empty(len(queries), dtype=np.int64)
-    order = np.argsort(stage, kind="stable")
-    anchors, starts, counts = np.unique(stage[order], return_index=True, return_counts=True)
-    by_size = np.argsort(counts, kind="stable")  # anchors with about as many queries make one product
-
-    def search(groups: np.ndarray) -> None:
-        near = around[anchors[groups]]
-        most = int(counts[groups].max())
-        # The last query of a smaller group is repeated.
-        places = starts[groups, None] + np.minimum(np.arange(most), counts[groups, None] - 1)
-        mine = order[places]
-        products = queries[mine] @ points[near].transpose(0, 2, 1) - half[near][:, None]
-        out[mine] = np.take_along_axis(near, products.argmax(2), 1)
-
-    def search_all(some: list[np.ndarray]) -> None:
-        for groups in some:
-            search(groups)
-
-    blocks = [by_size[i : i + _GROUPS] for i in range(0, len(by_size), _GROUPS)]
-    n = workers()
-    in_parallel([partial(search_all, blocks[number::n]) for number in range(n)])
-    return out
+    """The same with all coordinates multiplied by a power of two that brings the largest to 1."""
+    halves = [v.astype(np.float64) / 2 for v in (queries, points)]
+    largest = max(np.abs(v - centre / 2).max(initial=0) for v in halves)
+    if not np.isfinite(largest):  # the mean of very large numbers
+        largest = max(np.abs(v).max(initial=0) for v in halves)
+    if largest == 0:  # all in one place
+        return np.zeros(len(queries), dtype=np.int64)
+    exponent = -int(np.frexp(largest)[1])
+    queries, points = (np.ldexp(v, exponent) for v in halves)
+    return _blocked(queries, points, rows, columns)
 
 
-def _closest(queries: np.ndarray, points: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-    """For each query which of its few candidates is nearest."""
-    half = (points**2).sum(1) / 2
-    values = np.empty(candidates.shape, dtype=points.dtype)
-    for column, ids in enumerate(candidates.T):
-        values[:, column] = np.einsum("qk,qk->q", queries, points[ids]) - half[ids]
-    return values.argmax(1)
+def _look(part: _Range, block: np.ndarray, reach: np.ndarray, points: np.ndarray, start: int, rows: int) -> None:
+    """Add the points of one block that may be nearest to some of the queries, given what is known of the others."""
+    d = block.shape[0] - 1
+    products = np.empty((min(rows, len(part.queries)), block.shape[1]), dtype=np.float32)
+    farthest = reach.max(keepdims=True)
+    for i in range(0, len(part.queries), rows):
+        queries, norms, low = (v[i : i + rows] for v in (part.queries, part.norms, part.low))
+        out = np.matmul(queries, block, out=products[: len(queries)])
+        wrong = rounding_bound(norms, farthest, d)
+        np.maximum(low, out.max(1) - wrong, out=low)
+        enough = low - wrong
+        good = np.flatnonzero(out >= enough[:, None])  # twice as quick as nonzero of a matrix
+        if len(good) > _MANY * len(queries):
+            row = np.arange(len(queries))
+            column = scipy.spatial.distance.cdist(part.given[i : i + rows], points, "sqeuclidean").argmin(1)
+        else:
+            row, column = np.divmod(good, out.shape[1])
+        value = out[row, column]
+        own = rounding_bound(norms[row], reach[column], d)
+        np.maximum.at(low, row, value - own)
+        part.add(row + i, column + start, value + own, value + own >= low[row])
 
 
-def _float32(values: Tensor) -> np.ndarray:
-    return np.ascontiguousarray(values.detach().numpy(), dtype=np.float32)
+def _decide(part: _Range, points: np.ndarray) -> Shaped[np.ndarray, " n"]:
+    rows, columns, high = (np.concatenate(v) for v in (part.rows, part.columns, part.high))
+    good = high >= part.low[rows]
+    return settled(part.given, points, rows[good], columns[good])

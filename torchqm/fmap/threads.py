@@ -4,17 +4,59 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
-from typing import TypeVar
+from threading import Lock
+from typing import Any, TypeVar
 
 import torch
-from threadpoolctl import threadpool_limits
+from threadpoolctl import OpenBLASController, ThreadpoolController
 
-__all__ = ["in_parallel", "in_shares", "one_thread", "workers"]
+__all__ = ["in_parallel", "in_shares", "one_thread", "threads_as_before", "workers"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _WORKERS: ContextVar[int] = ContextVar("workers", default=1)
+_BEFORE: ContextVar[int] = ContextVar("before", default=0)  # torch's threads outside; 0 where no thread was taken
+
+
+class _Blas:
+    """BLAS has one number of threads for the whole process: the first to come limits it, the last to go restores it.
+
+    threadpoolctl 3.8 lets one thread of Python set OpenBLAS's number and ignores all others, without a
+    word. Here it is set under a lock, so whoever has that right loses it.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._users = Lock(), 0
+        self._limits: Any = None
+
+    def take(self) -> None:
+        with self._lock:
+            if not self._users:
+                with _right_to_set():
+                    # Selected, so that only these are restored: OpenMP's number is torch's and each thread's own.
+                    self._limits = ThreadpoolController().select(user_api="blas").limit(limits=1)
+            self._users += 1
+
+    def give_back(self) -> None:
+        with self._lock:
+            self._users -= 1
+            if not self._users:
+                with _right_to_set():
+                    self._limits.restore_original_limits()
+
+
+@contextmanager
+def _right_to_set() -> Iterator[None]:
+    clear = getattr(OpenBLASController, "clear_controlling_thread", lambda force: None)
+    clear(force=True)
+    try:
+        yield
+    finally:
+        clear(force=True)
+
+
+_BLAS = _Blas()
 
 
 @contextmanager
@@ -23,22 +65,53 @@ def one_thread() -> Iterator[None]:
 
     Thousands of products and eigenproblems of a hundred rows: threads only wait for each other there (2.4 seconds on
     one became 6.5 on two, and a minute where another process wants the cores, too). The threads that were allowed
-    before are workers for :func:`in_parallel`.
+    before are workers for :func:`in_parallel`. Several of Python's threads may be inside at the same time.
 
     Example:
         >>> with one_thread():
         ...     torch.get_num_threads()
         1
     """
+    if _BEFORE.get():  # one inside another, or a task of a worker
+        yield
+        return
     before = torch.get_num_threads()
-    token = _WORKERS.set(max(before, _WORKERS.get()))
+    tokens = _WORKERS.set(max(before, _WORKERS.get())), _BEFORE.set(before)
+    _BLAS.take()
     torch.set_num_threads(1)
     try:
-        with threadpool_limits(1, "blas"):
-            yield
+        yield
     finally:
+        _BLAS.give_back()
         torch.set_num_threads(before)
-        _WORKERS.reset(token)
+        _WORKERS.reset(tokens[0])
+        _BEFORE.reset(tokens[1])
+
+
+@contextmanager
+def threads_as_before() -> Iterator[None]:
+    """Inside :func:`one_thread`, run the body as if outside of it: for what others wrote, such as a network.
+
+    Example:
+        >>> before = torch.get_num_threads()
+        >>> with one_thread(), threads_as_before():
+        ...     torch.get_num_threads() == before
+        True
+    """
+    before = _BEFORE.get()
+    if not before:
+        yield
+        return
+    tokens = _WORKERS.set(1), _BEFORE.set(0)
+    _BLAS.give_back()
+    torch.set_num_threads(before)
+    try:
+        yield
+    finally:
+        _BLAS.take()
+        torch.set_num_threads(1)
+        _WORKERS.reset(tokens[0])
+        _BEFORE.reset(tokens[1])
 
 
 def workers() -> int:

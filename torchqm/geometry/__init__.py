@@ -12,6 +12,7 @@ from torchqm.geometry.check import (
 from torchqm.geometry.curvature import mean_curvature, vertex_normals
 from torchqm.geometry.diffusion import diffused
 from torchqm.geometry.geodesic import EdgePoints, distance_to_curve, distances, edge_graph, nodal_crossings
+from torchqm.geometry.geodesic_solver import GeodesicSolver
 from torchqm.geometry.gradient import VertexGradient, tangent_frames, vertex_gradient
 from torchqm.geometry.io import load_mesh, save_mesh
 from torchqm.geometry.laplacian import (
@@ -27,6 +28,7 @@ from torchqm.geometry.sampling import area_samples, farthest_points
 
 __all__ = [
     "EdgePoints",
+    "GeodesicSolver",
     "Laplacian",
     "Mesh",
     "MeshError",

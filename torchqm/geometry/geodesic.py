@@ -1,7 +1,6 @@
 """Geodesic distances on a mesh: from vertices, and from a curve such as the axis where a function changes sign."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from warnings import warn
 
 import numpy as np
@@ -10,12 +9,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchqm.geometry.check import clean_faces, inspect_mesh, orient_faces
+from torchqm.geometry.geodesic_solver import GeodesicSolver
+from torchqm.geometry.geodesic_surface import Surface, symmetric_graph, vertex_ids
 from torchqm.geometry.mesh import Mesh
 
 __all__ = ["EdgePoints", "distance_to_curve", "distances", "edge_graph", "nodal_crossings"]
-
-METHODS = ("fast_marching", "heat", "dijkstra", "exact")
 
 
 class EdgePoints(NamedTuple):
@@ -37,6 +35,9 @@ def distances(
     targets: Int[Tensor, " T"] | None = None,
 ) -> Float[Tensor, "S T"]:
     """Geodesic distance of every vertex to each source.
+
+    What does not depend on the source is set up once for a mesh and kept for later calls
+    (:meth:`torchqm.geometry.geodesic_solver.GeodesicSolver.kept`).
 
     Measured against exact distances on TOSCA cat0 (28k vertices, 8 spread sources) and david0 (53k, 4), mean relative
     error and seconds for a source on one core: ``fast_marching`` 0.9% and 0.7%, 0.06 and 0.13 s, always a little too
@@ -70,27 +71,10 @@ def distances(
         R. Kimmel, J. Sethian, "Computing geodesic paths on manifolds", 1998.
         K. Crane, C. Weischedel, M. Wardetzky, "The heat method for distance computation", 2017.
     """
-    ids = _vertex_ids(mesh, "sources", sources)
-    keep = None if targets is None else _vertex_ids(mesh, "targets", targets)
-    if method not in METHODS:
-        raise ValueError(f"method is {method!r}; allowed are {', '.join(map(repr, METHODS))}")
-    surface = _Surface(mesh)
-    local = surface.local[ids]
-    from_source = {
-        "fast_marching": _fast_marching,
-        "heat": _heat,
-        "dijkstra": _dijkstra,
-        "exact": _exact,
-    }[method](surface)
-    out = np.full((len(ids), mesh.n_verts if keep is None else len(keep)), np.inf)
-    row = np.full(mesh.n_verts, np.inf)
-    for k, (source, vertex) in enumerate(zip(local.tolist(), ids.tolist(), strict=True)):
-        row.fill(np.inf)
-        if source >= 0:
-            row[surface.ids] = from_source(source) * surface.scale
-        row[vertex] = 0.0
-        out[k] = row if keep is None else row[keep]
-    return torch.from_numpy(out)
+    solver = GeodesicSolver.kept(mesh, method)
+    if solver.note:
+        warn(solver.note, stacklevel=2)
+    return solver.distances(sources, targets)
 
 
 def distance_to_curve(
@@ -119,7 +103,7 @@ def distance_to_curve(
     """
     if method not in ("fast_marching", "dijkstra"):
         raise ValueError(f"method is {method!r}; allowed are 'fast_marching' and 'dijkstra'")
-    surface = _Surface(mesh)
+    surface = Surface(mesh)
     seeds, start = _curve_seeds(mesh, surface, EdgePoints(*curve))
     out = np.full(mesh.n_verts, np.inf)
     if method == "fast_marching" and surface.why_not_marching is None:
@@ -167,107 +151,10 @@ def nodal_crossings(mesh: Mesh, f: Float[Tensor, " V"]) -> EdgePoints:
 def edge_graph(mesh: Mesh) -> "scipy.sparse.csr_array":
     """Symmetric ``(V, V)`` matrix of edge lengths; edges of length 0 are stored entries."""
     edges, lengths = mesh.edges.numpy(), mesh.edge_lengths.numpy()
-    return _symmetric_graph(mesh.n_verts, edges, lengths)
+    return symmetric_graph(mesh.n_verts, edges, lengths)
 
 
-class _Surface:
-    """The referenced part of a mesh at size one, as the solvers want it."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        self.mesh = mesh
-        faces = clean_faces(mesh).numpy()
-        self.ids, local = np.unique(faces, return_inverse=True)
-        self.faces = np.ascontiguousarray(local.reshape(faces.shape))
-        self.local = np.full(mesh.n_verts, -1, dtype=np.int64)
-        self.local[self.ids] = np.arange(len(self.ids))
-        verts = mesh.numpy()[0][self.ids]
-        verts = verts - verts[:1]
-        self.scale = float(np.abs(verts).max(initial=0.0)) or 1.0
-        self.verts = np.ascontiguousarray(verts / self.scale)
-        self.n = len(self.ids)
-        self._oriented: np.ndarray | None = None
-        self._why_not: str | None = None
-        self._known = False
-
-    @property
-    def compact(self) -> Mesh:
-        """The same part as a mesh of its own."""
-        return Mesh(torch.from_numpy(self.verts), torch.from_numpy(self.faces), self.mesh.name, self.mesh.path)
-
-    @property
-    def why_not_marching(self) -> str | None:
-        """Why fast marching cannot run here, or None."""
-        if not self._known:
-            self._known = True
-            report = inspect_mesh(self.compact) if self.n else None
-            if report is not None and not report.manifold:
-                self._why_not = (
-                    f"fast marching needs a manifold ({report.n_nonmanifold_edges} non-manifold edges, "
-                    f"{report.n_nonmanifold_verts} non-manifold vertices)"
-                )
-            elif report is not None and report.oriented:
-                self._oriented = self.faces
-            else:
-                oriented = orient_faces(self.compact)
-                self._oriented = None if oriented is None else oriented.numpy()
-                if oriented is None:
-                    self._why_not = "fast marching needs an orientable surface"
-        return self._why_not
-
-    def marching_solver(self) -> tuple[Any, int]:
-        """A potpourri3d solver, and how many of its vertices are real (the first ones)."""
-        import potpourri3d
-
-        if self.why_not_marching is not None or self._oriented is None:
-            raise ValueError(f"{self.mesh.label}: {self.why_not_marching}")
-        # potpourri3d 1.4 never walks along a boundary edge against its only half-edge, which makes distances near a
-        # boundary too long. A flap on every boundary edge, the parallelogram point of its triangle, gives it the other
-        # half-edge; a path over the flap is longer than the edge itself, so no distance gets shorter.
-        faces = self._oriented
-        keys = faces * self.n + faces[:, [1, 2, 0]]
-        twins = faces[:, [1, 2, 0]] * self.n + faces
-        face, corner = np.nonzero(~np.isin(keys, twins))
-        a, b, c = faces[face, corner], faces[face, (corner + 1) % 3], faces[face, (corner + 2) % 3]
-        apex = self.n + np.arange(len(a))
-        verts = np.concatenate([self.verts, self.verts[a] + self.verts[b] - self.verts[c]])
-        flaps = np.stack([b, a, apex], axis=1)
-        return potpourri3d.MeshFastMarchingDistanceSolver(verts, np.concatenate([faces, flaps])), self.n
-
-    def graph(self) -> "scipy.sparse.csr_array":
-        compact = self.compact
-        return _symmetric_graph(self.n, compact.edges.numpy(), compact.edge_lengths.numpy())
-
-
-_FromSource = Callable[[int], np.ndarray]
-
-
-def _fast_marching(surface: _Surface) -> _FromSource:
-    if surface.why_not_marching is not None:
-        warn(f"{surface.mesh.label}: {surface.why_not_marching}; the heat method is used instead", stacklevel=3)
-        return _heat(surface)
-    solver, n = surface.marching_solver()
-    return lambda source: np.asarray(solver.compute_distance([[(source, [])]], [], False)).reshape(-1)[:n]
-
-
-def _heat(surface: _Surface) -> _FromSource:
-    import potpourri3d
-
-    solver = potpourri3d.MeshHeatMethodDistanceSolver(surface.verts, surface.faces)
-    _, piece = scipy.sparse.csgraph.connected_components(surface.graph(), directed=False)
-
-    def from_source(source: int) -> np.ndarray:
-        out = np.asarray(solver.compute_distance(source)).reshape(-1)
-        return np.where(piece == piece[source], out, np.inf)
-
-    return from_source
-
-
-def _dijkstra(surface: _Surface) -> _FromSource:
-    graph = surface.graph()
-    return lambda source: scipy.sparse.csgraph.dijkstra(graph, indices=np.array([source]))[0]
-
-
-def _dijkstra_from_seeds(surface: _Surface, seeds: np.ndarray, start: np.ndarray) -> np.ndarray:
+def _dijkstra_from_seeds(surface: Surface, seeds: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Shortest paths from one extra node that reaches each seed at its own start value."""
     graph = surface.graph().tocoo()
     row = np.concatenate([graph.row, np.full(len(seeds), surface.n)])
@@ -276,40 +163,7 @@ def _dijkstra_from_seeds(surface: _Surface, seeds: np.ndarray, start: np.ndarray
     return scipy.sparse.csgraph.dijkstra(whole, indices=np.array([surface.n]))[0, : surface.n]
 
 
-def _exact(surface: _Surface) -> _FromSource:
-    try:
-        from pygeodesic.geodesic import PyGeodesicAlgorithmExact
-    except ImportError as error:
-        raise ImportError(
-            "method='exact' needs the package pygeodesic (pip install pygeodesic); 'fast_marching' is within about 1%"
-        ) from error
-    report = inspect_mesh(surface.compact)
-    if not report.manifold:
-        raise ValueError(
-            f"{surface.mesh.label}: method='exact' needs a manifold ({report.n_nonmanifold_edges} non-manifold edges, "
-            f"{report.n_nonmanifold_verts} non-manifold vertices); 'heat' and 'dijkstra' do not"
-        )
-    solver = PyGeodesicAlgorithmExact(surface.verts, surface.faces)
-    return lambda source: np.asarray(solver.geodesicDistances(np.array([source]))[0])
-
-
-def _vertex_ids(mesh: Mesh, name: str, ids: Tensor | np.ndarray | list[int]) -> np.ndarray:
-    array = np.atleast_1d(np.asarray(ids))
-    if array.ndim != 1 or not (np.issubdtype(array.dtype, np.integer) or array.size == 0):
-        raise ValueError(f"{name} must be one row of integer vertex ids, not {array.dtype} of shape {array.shape}")
-    array = array.astype(np.int64)
-    bad = (array < 0) | (array >= mesh.n_verts)
-    if bad.any():
-        raise ValueError(f"{name} holds {array[bad][0]}; {mesh.label} has vertices 0 to {mesh.n_verts - 1}")
-    return array
-
-
-def _symmetric_graph(n: int, edges: np.ndarray, lengths: np.ndarray) -> "scipy.sparse.csr_array":
-    row, col = np.concatenate([edges[:, 0], edges[:, 1]]), np.concatenate([edges[:, 1], edges[:, 0]])
-    return scipy.sparse.coo_array((np.concatenate([lengths, lengths]), (row, col)), shape=(n, n)).tocsr()
-
-
-def _curve_seeds(mesh: Mesh, surface: _Surface, curve: EdgePoints) -> tuple[np.ndarray, np.ndarray]:
+def _curve_seeds(mesh: Mesh, surface: Surface, curve: EdgePoints) -> tuple[np.ndarray, np.ndarray]:
     """Local vertex ids around the curve and their distance to it at the surface's own scale."""
     edges, t = np.asarray(curve.edges).reshape(-1, 2), np.asarray(curve.t, dtype=np.float64)
     if len(edges) == 0 or len(edges) != len(t):
@@ -318,7 +172,7 @@ def _curve_seeds(mesh: Mesh, surface: _Surface, curve: EdgePoints) -> tuple[np.n
         )
     if not ((t >= 0) & (t <= 1)).all():
         raise ValueError(f"curve has parameters from {t.min():g} to {t.max():g}; allowed are 0 to 1")
-    _vertex_ids(mesh, "curve", np.ascontiguousarray(edges.reshape(-1)))
+    vertex_ids(mesh.label, mesh.n_verts, "curve", np.ascontiguousarray(edges.reshape(-1)))
     ends, n = surface.local[edges], surface.n
     keys = np.minimum(*ends.T) * n + np.maximum(*ends.T)
     sides = np.stack([surface.faces, surface.faces[:, [1, 2, 0]]], axis=2)  # (F, 3, 2)

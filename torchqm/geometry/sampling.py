@@ -11,6 +11,10 @@ from torchqm.geometry.mesh import Mesh
 
 __all__ = ["area_samples", "farthest_points"]
 
+_WHOLE = 10
+"""Points whose distances a run of Dijkstra's algorithm gives. Later ones change a part of the surface only: a front
+that stops where it is not nearer costs less than a run, which has to set up all vertices."""
+
 
 def area_samples(mesh: Mesh, n: int, generator: torch.Generator | int = 0) -> Int[Tensor, " n"]:
     """Draw different vertices, each time with probabilities in proportion to the areas of those left.
@@ -43,8 +47,8 @@ def area_samples(mesh: Mesh, n: int, generator: torch.Generator | int = 0) -> In
 def farthest_points(mesh: Mesh, n: int, start: int | None = None, method: str = "dijkstra") -> Int[Tensor, " n"]:
     """Farthest point sampling: every next vertex is the one farthest from all before it.
 
-    Deterministic: of equally far vertices the smallest id is taken. Each step looks only as far as the current covering
-    radius, so the steps get cheaper as the points get denser.
+    Deterministic: of equally far vertices the smallest id is taken. Of a new point only the distances are computed that
+    are shorter than those to the points before it, so the steps get cheaper as the points get denser.
 
     Args:
         mesh: the surface; unreferenced vertices are never taken, and every component gets a point before any gets two.
@@ -89,14 +93,40 @@ def farthest_points(mesh: Mesh, n: int, start: int | None = None, method: str = 
         if graph is None:
             offsets = verts - verts[point]
             distance = np.einsum("vi,vi->v", offsets, offsets)  # squared: the order is the same
+            np.minimum(nearest, distance, out=nearest)
+            nearest[point] = -1.0
+        elif k < _WHOLE:
+            limit = max(float(nearest.max()), 0.0)
+            np.minimum(nearest, scipy.sparse.csgraph.dijkstra(graph, indices=[point], limit=limit)[0], out=nearest)
+            nearest[point] = -1.0
         else:
-            distance = scipy.sparse.csgraph.dijkstra(
-                graph, indices=np.array([point]), limit=max(float(nearest.max()), 0.0)
-            )[0]
-        np.minimum(nearest, distance, out=nearest)
-        nearest[point] = -1.0
+            _lower(nearest, graph, point)
         point = int(nearest.argmax())
     return torch.from_numpy(out)
+
+
+def _lower(nearest: np.ndarray, graph: "scipy.sparse.csr_array", point: int) -> None:
+    """``nearest = min(nearest, distance to the point)`` along edges, by a front that stops where it is not nearer.
+
+    The result is that of Dijkstra's algorithm bit for bit: ``nearest`` of a neighbour is at most ``nearest`` here plus
+    the edge, and rounded sums keep that order, so nothing behind a vertex where the front stops could be shortened.
+    The point itself, and what is taken already, is at -1.
+    """
+    nearest[point] = -1.0
+    front, distance = np.array([point]), np.zeros(1)
+    number = np.empty(len(nearest), dtype=np.int64)
+    while front.size:
+        starts = graph.indptr[front]
+        counts = graph.indptr[front + 1] - starts
+        ends = counts.cumsum()
+        entries = np.arange(ends[-1]) + np.repeat(starts - ends + counts, counts)
+        to, reached = graph.indices[entries], np.repeat(distance, counts) + graph.data[entries]
+        closer = reached < nearest[to]
+        to, reached = to[closer], reached[closer]
+        np.minimum.at(nearest, to, reached)
+        number[to] = np.arange(len(to))  # of entries of one vertex the last one stays
+        front = to[number[to] == np.arange(len(to))]
+        distance = nearest[front]
 
 
 def _unit_size(mesh: Mesh) -> Mesh:

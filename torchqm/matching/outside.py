@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchqm.fmap.threads import threads_as_before
 from torchqm.matching.parameters import MatchError
 from torchqm.matching.shape import PreparedShape
 
@@ -25,14 +26,15 @@ def describe_pair(
     Args:
         x: the source.
         y: the target.
-        descriptors: called with each of the two.
+        descriptors: called with each of the two, with the threads that the caller has.
 
     Raises:
         MatchError: values that are not finite, no ``(V, C)`` table, or another C on the other shape.
     """
     found = []
     for shape in (x, y):
-        values = torch.as_tensor(descriptors(shape)).detach()
+        with threads_as_before():
+            values = torch.as_tensor(descriptors(shape)).detach()
         given = f"descriptors of {shape.mesh.label}: {values.dtype} of shape {tuple(values.shape)}"
         if values.ndim != 2 or values.shape[0] != shape.n_verts or not values.shape[1]:
             raise MatchError(f"{given}; expected ({shape.n_verts}, C), a row for each vertex and one column at least")

@@ -7,8 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.fmap.convert import fmap_to_p2p
-from torchqm.fmap.nearest import SurfaceSearch
 from torchqm.fmap.refine import growing_sizes, nearest_isometry, semi_quotient_icp, semi_upsample
+from torchqm.fmap.surface_search import SurfaceSearch
 from torchqm.matching.described import pair_descriptors
 from torchqm.matching.initial import basis_size, fmap_from_coefficients
 from torchqm.matching.parameters import MatchParameters

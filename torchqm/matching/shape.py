@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchqm.fmap.nearest import SurfaceSearch
+from torchqm.fmap.surface_search import SurfaceSearch
 from torchqm.fmap.threads import in_parallel
 from torchqm.geometry.check import MeshReport, clean_faces, inspect_mesh, orient_faces
 from torchqm.geometry.laplacian import laplacian

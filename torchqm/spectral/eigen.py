@@ -60,7 +60,13 @@ def fix_signs(evecs: Float[Tensor, "V K"]) -> Float[Tensor, "V K"]:
 
 
 def eigenbasis(
-    operator: Laplacian, k: int, name: str = "mesh", *, tol: float = TOLERANCE, solver: str = "auto"
+    operator: Laplacian,
+    k: int,
+    name: str = "mesh",
+    *,
+    tol: float = TOLERANCE,
+    solver: str = "auto",
+    device: str | torch.device = "cpu",
 ) -> SpectralBasis:
     """The ``k`` lowest eigenpairs of ``W phi = lambda M phi``, as exact as ``tol`` says.
 
@@ -76,13 +82,14 @@ def eigenbasis(
         name: what error messages call the shape.
         tol: bound of :func:`relative_residuals`; less is not to be had where ``10 eps |W| / lambda`` is larger.
         solver: ``auto``, ``dense``, ``lanczos`` or ``arpack`` (each alone: an error where it fails).
+        device: ``cpu`` or ``cuda``: where block Lanczos works. The other solvers are on the CPU, and so is the result.
 
     Returns:
         The basis, eigenvalues ascending, signs by :func:`fix_signs`.
 
     Raises:
         SpectrumError: fewer vertices than ``k``, entries that are not finite, or no convergence (with its numbers).
-        ValueError: an unknown ``solver``, or ``tol`` not in ``(0, 1e-3]``.
+        ValueError: an unknown ``solver`` or ``device``, one that is not there, or ``tol`` not in ``(0, 1e-3]``.
 
     Warns:
         SpectrumWarning: block Lanczos did not reach ``tol``; ARPACK was asked.
@@ -90,20 +97,27 @@ def eigenbasis(
     References:
         Paper, section 3 (the multiscale basis); Levy and Zhang 2010 for shift-invert.
     """
-    basis, note = eigenbasis_and_note(operator, k, name, tol=tol, solver=solver)
+    basis, note = eigenbasis_and_note(operator, k, name, tol=tol, solver=solver, device=device)
     if note:
         warnings.warn(note, SpectrumWarning, stacklevel=2)
     return basis
 
 
 def eigenbasis_and_note(
-    operator: Laplacian, k: int, name: str = "mesh", *, tol: float = TOLERANCE, solver: str = "auto"
+    operator: Laplacian,
+    k: int,
+    name: str = "mesh",
+    *,
+    tol: float = TOLERANCE,
+    solver: str = "auto",
+    device: str | torch.device = "cpu",
 ) -> tuple[SpectralBasis, str]:
     """The same as :func:`eigenbasis`, with the warning as text; an empty one if there is nothing to say."""
     if solver not in SOLVERS:
         raise ValueError(f"solver: {solver!r} given, allowed are {', '.join(SOLVERS)}")
     if not 0 < tol <= 1e-3:
         raise ValueError(f"tol: {tol} given, allowed is more than 0 and at most 1e-3")
+    where = _device(device)
     mass = operator.mass.numpy().astype(np.float64)
     used = np.flatnonzero(mass > 0)
     if k < 1 or k > used.size:
@@ -121,7 +135,7 @@ def eigenbasis_and_note(
     matrix = (scale @ stiffness @ scale).tocsc()
     if not (np.isfinite(matrix.data).all() and np.isfinite(area)):
         raise SpectrumError(f"{name}: its Laplacian has entries that are NaN or infinite")
-    evals, rows, note = _solve(((matrix + matrix.T) / 2).tocsc(), k, tol, solver, name)
+    evals, rows, note = _solve(((matrix + matrix.T) / 2).tocsc(), k, tol, solver, name, where)
     evecs = torch.zeros(mass.size, k, dtype=torch.float64)
     evecs[torch.from_numpy(used)] = (rows / torch.from_numpy(root * np.sqrt(area))).T
     basis = SpectralBasis(torch.from_numpy(np.maximum(evals, 0.0) / area), fix_signs(evecs), operator.mass)
@@ -129,7 +143,7 @@ def eigenbasis_and_note(
 
 
 def _solve(
-    matrix: "scipy.sparse.csc_array", k: int, tol: float, solver: str, name: str
+    matrix: "scipy.sparse.csc_array", k: int, tol: float, solver: str, name: str, device: str
 ) -> tuple[np.ndarray, Tensor, str]:
     """Eigenvalues ``(k,)`` ascending, eigenvectors as rows ``(k, n)``, and what is to be said about them."""
     n, note = matrix.shape[0], ""
@@ -140,7 +154,7 @@ def _solve(
     if solver != "arpack":
         try:
             # Weyl: the k-th eigenvalue of a surface of area 1 is about 4 pi k.
-            pairs = lowest_eigenpairs(matrix, k, tol, 4 * np.pi * k)
+            pairs = lowest_eigenpairs(matrix, k, tol, 4 * np.pi * k, device=device)
             return pairs.evals, pairs.evecs, note
         except LanczosError as error:
             if solver == "lanczos":
@@ -151,6 +165,16 @@ def _solve(
     evals, vectors = _shift_invert(matrix, k, name)
     order = np.argsort(evals, kind="stable")
     return evals[order], torch.from_numpy(np.ascontiguousarray(vectors[:, order].T)), note
+
+
+def _device(given: str | torch.device) -> str:
+    """The name of a device that block Lanczos knows and that is there."""
+    text = str(given)
+    if text != "cpu" and text.split(":")[0] != "cuda":
+        raise ValueError(f"device: {text!r} given, allowed are 'cpu' and 'cuda'")
+    if text != "cpu" and not torch.cuda.is_available():
+        raise ValueError(f"device: {text!r} given, but torch sees no CUDA device here")
+    return text
 
 
 def _shift_invert(matrix: "scipy.sparse.csc_array", k: int, name: str) -> tuple[np.ndarray, np.ndarray]:

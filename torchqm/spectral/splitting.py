@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp
+from math import exp, log, sqrt
 
 import torch
 from jaxtyping import Float
@@ -13,7 +13,6 @@ from torchqm.spectral.descriptors import split_descriptors
 __all__ = ["Splitting"]
 
 _ROWS = 512  # of a block: a few arrays of 512 x 100 stay in the cache of one core
-_MOST = 24  # intervals up to which the products below stay in double precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +68,7 @@ class Splitting:
         if self.s == 0:
             return weights.T @ values
         n, c = values.shape
-        if not 1 <= self.s <= _MOST:
+        if not 1 <= self.s <= _most(values.dtype):
             return weights.T @ split_descriptors([torch.stack([self.low, self.high]), values], self.s)[1]
         total = weights.new_zeros(self.s, weights.shape[1], c)
         tiny = torch.finfo(values.dtype).tiny
@@ -83,3 +82,8 @@ class Splitting:
                 bump.mul_(growth).mul_(exp(-2 * i - 1))
                 total[i].addmm_(part, bump)
         return total.permute(1, 2, 0).reshape(weights.shape[1], -1)
+
+
+def _most(dtype: torch.dtype) -> int:
+    """Intervals up to which the first bump, ``exp(-s^2)`` at least, is a normal number (9 or 26), as products need."""
+    return int(sqrt(-log(torch.finfo(dtype).tiny)))

@@ -12,7 +12,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.fmap.convert import fmap_to_p2p, nearest_used
-from torchqm.fmap.nearest import SurfaceSearch, nearest_rows
+from torchqm.fmap.nearest import nearest_rows
+from torchqm.fmap.surface_search import SurfaceSearch
 from torchqm.geometry.sampling import farthest_points
 from torchqm.matching.baselines.base import NOTHING, BaselineResult, Given, make_result
 from torchqm.matching.baselines.functional import Start
