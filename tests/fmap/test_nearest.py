@@ -114,6 +114,18 @@ def test_of_mirror_images_the_first(rows, columns):
     assert float((apart[:, 1] - apart[:, 0]).max()) < 1e-12  # they do come in pairs
 
 
+def test_without_the_second_step_one_of_those_that_rounding_does_not_tell_apart():
+    generic, points = noise(500, 12), noise(900, 12, seed=1)
+    assert torch.equal(nearest_rows(generic, points, exact=False), nearest_rows(generic, points))
+    queries, points = mirrored(600, 10)
+    found, best = (nearest_rows(queries, points, exact=exact) for exact in (False, True))
+    assert torch.equal(found, nearest_rows(queries, points, exact=False))
+    distances = torch.cdist(queries, points)
+    rows = torch.arange(len(queries))
+    torch.testing.assert_close(distances[rows, found], distances[rows, best], atol=1e-5, rtol=0)
+    assert not torch.equal(found, best)  # there are ties here, and only the second step looks for the first
+
+
 def test_what_single_precision_cannot_tell_apart():
     """Each point among copies that are further by less than a part in 10 million."""
     points = noise(50, 30)

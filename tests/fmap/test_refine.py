@@ -130,7 +130,7 @@ def test_quotient_icp_with_larger_groups(order):
 def test_it_stops_when_the_map_stays(pair, monkeypatch):
     calls = []
     search = module.nearest_used
-    monkeypatch.setattr(module, "nearest_used", lambda *a: calls.append(1) or search(*a))
+    monkeypatch.setattr(module, "nearest_used", lambda *a, **options: calls.append(1) or search(*a, **options))
     quotient_icp(pair.even, pair.even_x, pair.even_y, pair.samples, steps=50)
     assert len(calls) == 1
     start = pair.even + 0.08 * noise(*pair.even.shape)

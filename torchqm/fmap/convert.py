@@ -76,14 +76,16 @@ def _times(rows: Tensor, single: Tensor) -> Tensor:
     return rows.float() @ single
 
 
-def nearest_used(images: Float[Tensor, "Q Ky"], basis_y: SpectralBasis, time: float = 0.0) -> Int[Tensor, " Q"]:
-    """The vertex of y with area whose delta is nearest to each row of ``images``."""
+def nearest_used(
+    images: Float[Tensor, "Q Ky"], basis_y: SpectralBasis, time: float = 0.0, exact: bool = True
+) -> Int[Tensor, " Q"]:
+    """The vertex of y with area whose delta is nearest to each row of ``images`` (:func:`nearest_rows`)."""
     used = basis_y.mass > 0
     points = deltas(basis_y, time)
     if bool(used.all()):
-        return nearest_rows(images, points)
+        return nearest_rows(images, points, exact)
     ids = used.nonzero().flatten()
-    return ids[nearest_rows(images, points[ids])]
+    return ids[nearest_rows(images, points[ids], exact)]
 
 
 def p2p_to_fmap(p2p_yx: Int[Tensor, " Vy"], basis_x: SpectralBasis, basis_y: SpectralBasis) -> Float[Tensor, "Ky Kx"]:

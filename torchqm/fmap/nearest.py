@@ -19,12 +19,18 @@ _PAIRS = 4096  # distances computed at a time
 _LARGE = 2.0**60  # squares between 1 / _LARGE and _LARGE keep their digits in single precision
 
 
-def nearest_rows(queries: Float[Tensor, "Q D"], points: Float[Tensor, "P D"]) -> Int[Tensor, " Q"]:
+def nearest_rows(queries: Float[Tensor, "Q D"], points: Float[Tensor, "P D"], exact: bool = True) -> Int[Tensor, " Q"]:
     """For each query the index of the nearest point: ``argmin_p || q - p ||``, of equally near ones the first.
 
     Products in float32, in blocks (the Q x P matrix never exists), leave the points that the rounding of these products
     (:func:`rounding_bound`) does not rule out: mostly one. Where there are more, ``sum (q - p)^2`` in float64 decides.
-    So the answer is that of all distances in float64, at the price of single precision.
+    So the answer is that of all distances in float64, at little more than the price of single precision.
+
+    Args:
+        queries: ``(Q, D)``.
+        points: ``(P, D)``.
+        exact: false: leave out the second step. Where several points are nearest to within rounding, one of them comes
+            back, the same one each time; for steps of an iteration, which average over thousands of points.
 
     Raises:
         ValueError: the coordinates have different dimensions, there are no points, or some are not finite.
@@ -39,7 +45,7 @@ def nearest_rows(queries: Float[Tensor, "Q D"], points: Float[Tensor, "P D"]) ->
         raise ValueError("points: there are none to choose from")
     if not bool(torch.isfinite(queries.sum() + points.sum())):  # NaN and infinities survive a sum
         raise ValueError("queries and points must be finite; a spectral coordinate is NaN or infinite")
-    return torch.from_numpy(_blocked(queries.detach().numpy(), points.detach().numpy()))
+    return torch.from_numpy(_blocked(queries.detach().numpy(), points.detach().numpy(), exact=exact))
 
 
 def rounding_bound(queries: np.ndarray, points: np.ndarray, d: int) -> np.ndarray:
@@ -122,7 +128,11 @@ class _Range:
 
 
 def _blocked(
-    queries: Shaped[np.ndarray, "Q D"], points: Shaped[np.ndarray, "P D"], rows: int = _ROWS, columns: int = _COLUMNS
+    queries: Shaped[np.ndarray, "Q D"],
+    points: Shaped[np.ndarray, "P D"],
+    rows: int = _ROWS,
+    columns: int = _COLUMNS,
+    exact: bool = True,
 ) -> Shaped[np.ndarray, " Q"]:
     """The largest ``q . p - || p ||^2 / 2`` of each query, the second term as one coordinate more of the product."""
     n, d = queries.shape
@@ -135,7 +145,8 @@ def _blocked(
         np.subtract(queries, centre, out=longer[:, :d], casting="same_kind")
         norms = np.einsum("qd,qd->q", longer[:, :d], longer[:, :d])
     largest, norms, starts = norms.max(), np.sqrt(norms), range(0, len(points), columns)
-    best, second = np.full(n, -np.inf, dtype=np.float32), np.full(n, -np.inf, dtype=np.float32)
+    best = np.full(n, -np.inf, dtype=np.float32)
+    second = best.copy() if exact else best[:0]
     found, farthest = np.zeros(n, dtype=np.int64), np.zeros(1, dtype=np.float32)
     # One range of queries a worker; each range is put together from blocks that stay in the cache.
     chunk = rows * max(1, -(-n // (rows * workers())))  # the same products whatever the number of workers
@@ -148,6 +159,8 @@ def _blocked(
         in_parallel([partial(_improve, longer[r], block, start, rows, best[r], second[r], found[r]) for r in ranges])
     if not 1 / _LARGE < largest < _LARGE:
         return _rescaled(queries, points, centre, rows, columns)
+    if not exact:
+        return found
     wrong = rounding_bound(norms, farthest, d)
     # A point as near as the best one, at a distance r, is no longer than |q| + r: mostly less than the longest of all.
     square = np.maximum(norms**2 * np.float32(1.0001) - 2 * best + 2 * wrong, 0)
@@ -184,20 +197,18 @@ def _improve(
     second: np.ndarray,
     found: np.ndarray,
 ) -> None:
-    """Write in ``found`` the points of one block better than ``best``, and in ``second`` the next best value."""
+    """Write in ``found`` the points of one block better than ``best``, and in ``second``, if it has room, the next."""
     products = np.empty((min(rows, len(queries)), block.shape[1]), dtype=np.float32)
     for i in range(0, len(queries), rows):
         part = queries[i : i + rows]
-        out, everyone, here = (
-            np.matmul(part, block, out=products[: len(part)]),
-            np.arange(len(part)),
-            slice(i, i + rows),
-        )
+        everyone, here = np.arange(len(part)), slice(i, i + rows)
+        out = np.matmul(part, block, out=products[: len(part)])
         where = out.argmax(1)
         value = out[everyone, where]
-        out[everyone, where] = -np.inf
-        np.maximum(second[here], np.minimum(best[here], value), out=second[here])
-        np.maximum(second[here], out.max(1), out=second[here])
+        if len(second):
+            out[everyone, where] = -np.inf
+            np.maximum(second[here], np.minimum(best[here], value), out=second[here])
+            np.maximum(second[here], out.max(1), out=second[here])
         better = value > best[here]
         best[here][better] = value[better]
         found[here][better] = where[better] + start

@@ -75,7 +75,7 @@ def quotient_icp(
     mask = None if width is None else frequency_mask(basis_x.evals, basis_y.evals, width)
     settled = max(tolerance, torch.finfo(fmap_xy.dtype).eps ** 0.5)
     for _ in range(steps):
-        partners = nearest_used(sources @ fmap_xy.T, basis_y, time)
+        partners = nearest_used(sources @ fmap_xy.T, basis_y, time, exact=False)
         correspondence = targets[partners].T @ sources
         last, fmap_xy = fmap_xy, nearest_isometry(correspondence if mask is None else correspondence * mask)
         if float((fmap_xy - last).norm()) < settled * float(fmap_xy.norm()):
@@ -176,7 +176,7 @@ def upsample(
         sources = small_x.evecs[samples]
         for _ in range(steps):
             ky, kx = fmap_xy.shape
-            partners = nearest_used(basis_x.evecs[samples, :kx] @ fmap_xy.T, basis_y.truncate(ky))
+            partners = nearest_used(basis_x.evecs[samples, :kx] @ fmap_xy.T, basis_y.truncate(ky), exact=False)
             fmap_xy = project(small_y.evecs[partners].T @ sources)
     return fmap_xy
 
@@ -211,7 +211,7 @@ def semi_upsample(
         matching = int((basis_y.evals <= small_x.evals[-1] * (1 + 1e-6)).sum())
         small_y = basis_y.truncate(min(max(matching, 1), size))
         ky, kx = fmap_xy.shape
-        partners = nearest_used(basis_x.evecs[samples, :kx] @ fmap_xy.T, basis_y.truncate(ky))
+        partners = nearest_used(basis_x.evecs[samples, :kx] @ fmap_xy.T, basis_y.truncate(ky), exact=False)
         matrix = small_y.evecs[partners].T @ small_x.evecs[samples]
         mask = 1.0 if width is None else frequency_mask(small_x.evals, small_y.evals, width)
         fmap_xy = nearest_isometry(matrix * mask)

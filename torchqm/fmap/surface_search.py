@@ -85,12 +85,13 @@ class SurfaceSearch:
         queries32, points32 = _float32(given, centre), _float32(everything, centre)
         anchor_points = points32[self.anchors.numpy()]
         if guide is None:
-            stage = nearest_rows(torch.from_numpy(queries32), torch.from_numpy(anchor_points)).numpy()
+            stage = nearest_rows(torch.from_numpy(queries32), torch.from_numpy(anchor_points), exact=False).numpy()
         else:
             if guide.close.shape[0] != len(queries32):
                 raise ValueError(f"guide: has {guide.close.shape[0]} vertices, but there are {len(queries32)} queries")
             at_anchors = torch.from_numpy(queries32[guide.anchors.numpy()])
-            partners = nearest_rows(at_anchors, torch.from_numpy(anchor_points)).numpy()[guide.close.numpy()]
+            nearest = nearest_rows(at_anchors, torch.from_numpy(anchor_points), exact=False)
+            partners = nearest.numpy()[guide.close.numpy()]
             size = max(1, -(-len(partners) // workers()))
             some = [slice(i, i + size) for i in range(0, len(partners), size)]
             tasks = [partial(_closest, queries32[rows], anchor_points, partners[rows]) for rows in some]

@@ -94,10 +94,10 @@ def two_way_upsample(
         k_y, k_x = fmap_xy.shape
         look_x, look_y = (weight * k_y**0.5 * p.features for p in (places_x, places_y))
         points_x, points_y = torch.cat([at_x[:, :k_x], look_x], 1), torch.cat([at_y[:, :k_y], look_y], 1)
-        on_y = nearest_rows(torch.cat([at_x[:n_x, :k_x] @ fmap_xy.T, look_x[:n_x]], 1), points_y)
+        on_y = nearest_rows(torch.cat([at_x[:n_x, :k_x] @ fmap_xy.T, look_x[:n_x]], 1), points_y, exact=False)
         found = at_y[on_y, :size_y].T @ at_x[:n_x, :size_x] / n_x
         if back:
-            on_x = nearest_rows(torch.cat([at_y[:n_y, :k_y] @ fmap_xy, look_y[:n_y]], 1), points_x)
+            on_x = nearest_rows(torch.cat([at_y[:n_y, :k_y] @ fmap_xy, look_y[:n_y]], 1), points_x, exact=False)
             found = found + at_y[:n_y, :size_y].T @ at_x[on_x, :size_x] / n_y
         fmap_xy = project(found)
     return fmap_xy

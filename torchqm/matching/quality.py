@@ -61,7 +61,7 @@ def distance_change(
     k_y, k_x = fmap_xy.shape
     samples = x.samples[:n]
     among = y.basis.truncate(k_y).restricted(y.anchors)
-    partners = y.anchors[nearest_used(x.basis.evecs[samples, :k_x] @ fmap_xy.T, among)]
+    partners = y.anchors[nearest_used(x.basis.evecs[samples, :k_x] @ fmap_xy.T, among, exact=False)]
     before, after = x.basis.biharmonic(k)[samples], y.basis.biharmonic(k)[partners]
     gaps = []
     for step in (len(samples) // 3, len(samples) // 2 + 1):

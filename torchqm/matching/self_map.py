@@ -177,7 +177,8 @@ def reflection_score(fmap: Float[Tensor, "K K"], x: PreparedShape) -> float:
 def _images(fmap: Tensor, x: PreparedShape, parameters: MatchParameters) -> Tensor:
     """Where the samples go, in space."""
     small = x.basis.truncate(fmap.shape[0])
-    partners = nearest_used(small.evecs[x.samples[: parameters.n_samples]] @ fmap.T, small.restricted(x.anchors))
+    samples, among = x.samples[: parameters.n_samples], small.restricted(x.anchors)
+    partners = nearest_used(small.evecs[samples] @ fmap.T, among, exact=False)
     return x.mesh.verts[x.anchors[partners]]
 
 
