@@ -96,8 +96,11 @@ class SurfaceSearch:
             some = [slice(i, i + size) for i in range(0, len(partners), size)]
             tasks = [partial(_closest, queries32[rows], anchor_points, partners[rows]) for rows in some]
             stage = partners[np.arange(len(partners)), np.concatenate(in_parallel(tasks))]
-        rows, columns = _around(queries32, points32, stage, self.around.numpy())
-        return torch.from_numpy(settled(given, everything, rows, columns))
+        found, rows, columns = _around(queries32, points32, stage, self.around.numpy())
+        if len(rows):  # few, and doubtful
+            unsure, place = np.unique(rows, return_inverse=True)
+            found[unsure] = settled(given[unsure], everything, place, columns)
+        return torch.from_numpy(found)
 
 
 def _around(
@@ -105,13 +108,19 @@ def _around(
     points: Shaped[np.ndarray, "V K"],
     stage: Shaped[np.ndarray, " Q"],
     around: Shaped[np.ndarray, "A m"],
-) -> tuple[Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
-    """Queries and points around their anchors that may be the nearest there, as far as single precision can tell."""
+) -> tuple[Int[np.ndarray, " Q"], Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
+    """The nearest point around the anchor of each query in single precision, and all candidates where it cannot tell.
+
+    Returns:
+        ``(Q,)`` points, ``(N,)`` doubtful queries and for each of these a candidate; each doubtful one has all of its
+        candidates there.
+    """
     half = np.einsum("vk,vk->v", points, points) / 2
     norms, reach, d = np.sqrt(np.einsum("qk,qk->q", queries, queries)), np.sqrt(2 * half), points.shape[1]
     order = np.argsort(stage, kind="stable")
     anchors, starts, counts = np.unique(stage[order], return_index=True, return_counts=True)
     by_size = np.argsort(counts, kind="stable")  # anchors with about as many queries make one product
+    found = np.zeros(len(queries), dtype=np.int64)
 
     def search(groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         near = around[anchors[groups]]
@@ -120,21 +129,27 @@ def _around(
         places = starts[groups, None] + np.minimum(np.arange(most), counts[groups, None] - 1)
         mine = order[places]
         products = queries[mine] @ points[near].transpose(0, 2, 1) - half[near][:, None]
-        wrong = rounding_bound(norms[mine], reach[near].max(1)[:, None], d)
-        enough = products.max(2) - 2 * wrong
-        query, place = np.divmod(np.flatnonzero(products >= enough[:, :, None]), near.shape[1])
-        return mine.reshape(-1)[query], near[query // most, place]
+        where = products.argmax(2)[:, :, None]
+        best = np.take_along_axis(products, where, 2)[:, :, 0]
+        found[mine] = np.take_along_axis(near, where[:, :, 0], 1)
+        np.put_along_axis(products, where, -np.inf, 2)
+        enough = best - 2 * rounding_bound(norms[mine], reach[near].max(1)[:, None], d)
+        doubtful = products.max(2) >= enough
+        doubtful &= np.arange(most) < counts[groups, None]  # once, not as often as it is repeated
+        group, query = np.nonzero(doubtful)
+        one, place = np.nonzero(products[group, query] >= enough[group, query, None])
+        rows, ids = mine[group, query], near[group]
+        return np.concatenate([rows, rows[one]]), np.concatenate([found[rows], ids[one, place]])
 
     def search_all(some: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
         return [search(groups) for groups in some]
 
     blocks = [by_size[i : i + _GROUPS] for i in range(0, len(by_size), _GROUPS)]
     n = workers()
-    found = [pair for pairs in in_parallel([partial(search_all, blocks[i::n]) for i in range(n)]) for pair in pairs]
-    rows, columns = ([pair[i] for pair in found] for i in (0, 1))
-    if not found:
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    return np.concatenate(rows), np.concatenate(columns)
+    pairs = [pair for part in in_parallel([partial(search_all, blocks[i::n]) for i in range(n)]) for pair in part]
+    none = np.zeros(0, dtype=np.int64)
+    rows, columns = (np.concatenate([none, *(pair[i] for pair in pairs)]) for i in (0, 1))
+    return found, rows, columns
 
 
 def _closest(queries: np.ndarray, points: np.ndarray, candidates: np.ndarray) -> np.ndarray:
