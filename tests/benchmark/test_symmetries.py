@@ -45,7 +45,7 @@ def test_a_match_is_that_of_the_method_and_symmetries_are_found_once(tmp_path, p
         calls.append(arguments[0].mesh.name)
         return transferred_symmetry(*arguments)
 
-    monkeypatch.setattr("torchqm.matching.pipeline.transferred_symmetry", transfer)
+    monkeypatch.setattr("torchqm.matching.collection.transferred_symmetry", transfer)
     plain = matcher.match(x, y, given)
     results = [match_ours(matcher, x, y, given, KeptCollection(tmp_path, "quotient", PARAMETERS)) for _ in range(2)]
     assert len(calls) == 2  # once by the method itself, once for both of these

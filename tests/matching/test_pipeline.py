@@ -1,4 +1,4 @@
-"""torchqm.matching.pipeline: two poses of a small creature against the exact maps; exact pairs; every refusal.
+"""torchqm.matching.pipeline, .collection: two poses of a creature against the exact maps; exact pairs; every refusal.
 
 A posed pair has an error even where the method is right; what is asked for is a mean error of less than one edge: the
 right vertex or one of its neighbours. The wrong one of the two maps is off by more than three edges.
@@ -16,7 +16,7 @@ import torch
 from references.pairs import FAST, blob_meshes, exact_pair, mirrored, posed, reordered, with_loose_vertices
 from references.shapes import blob, prism, rotation
 
-import torchqm.matching.pipeline as module
+import torchqm.matching.collection as module
 import torchqm.matching.prepared as prepared
 from torchqm.data.synthetic import creature, exact_maps, symmetry_truth
 from torchqm.fmap import fmap_to_p2p

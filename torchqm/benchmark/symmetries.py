@@ -15,10 +15,10 @@ import torch
 from torchqm.benchmark.ledger import file_name
 from torchqm.geometry.files import write_whole
 from torchqm.matching.baselines import BaselineResult, Given, Ours
+from torchqm.matching.collection import Collection
 from torchqm.matching.known import KnownSymmetry
 from torchqm.matching.outside import Descriptors
 from torchqm.matching.parameters import MatchParameters
-from torchqm.matching.pipeline import Collection
 from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.cache_file import content_hash
 from torchqm.symmetry.group import SymmetryGroup
@@ -70,7 +70,7 @@ class KeptCollection(Collection):
 
     Args:
         folder: where the files are.
-        method: one of :data:`torchqm.matching.pipeline.METHODS`.
+        method: one of :data:`torchqm.matching.collection.METHODS`.
         parameters: of the method.
         descriptors: see :func:`torchqm.matching.match`; symmetries do not depend on them.
     """

@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise UserError("--symmetry none uses no symmetry, so --symmetry-source cannot be given with it")
     with staged_folder(arguments.out, FILES) as stage, Progress() as progress:
         from torchqm.matching import match
-        from torchqm.matching.pipeline import SYMMETRIES
+        from torchqm.matching.collection import SYMMETRIES
 
         parameters = make_parameters(arguments)
         descriptors = read_checkpoint(arguments.checkpoint)

@@ -1,19 +1,13 @@
 """Floor 5: the matchers: quotient, semi-quotient, symmetry transfer, and the pipeline that joins them."""
 
 from torchqm.matching.candidates import FullMap, full_map_from_blocks
+from torchqm.matching.collection import METHODS, SYMMETRIES, Collection
 from torchqm.matching.detect import Detection, detect_group
 from torchqm.matching.known import KnownSymmetry, extrinsic_symmetry, given_symmetry, no_symmetry, transferred_symmetry
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
 from torchqm.matching.outside import Descriptors
 from torchqm.matching.parameters import MatchError, MatchParameters
-from torchqm.matching.pipeline import (
-    METHODS,
-    SYMMETRIES,
-    Collection,
-    detect_symmetry,
-    find_symmetry,
-    match,
-)
+from torchqm.matching.pipeline import detect_symmetry, find_symmetry, match
 from torchqm.matching.prepared import match_prepared
 from torchqm.matching.quotient import QuotientMatch, choose_halves, match_quotient, refine_by_icp
 from torchqm.matching.result import MatchResult, SymmetryResult

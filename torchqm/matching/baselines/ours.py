@@ -11,10 +11,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.matching.baselines.base import NOTHING, BaselineResult, Given, make_result
+from torchqm.matching.collection import METHODS, Collection
 from torchqm.matching.known import KnownSymmetry, given_symmetry
 from torchqm.matching.outside import Descriptors
 from torchqm.matching.parameters import MatchError, MatchParameters
-from torchqm.matching.pipeline import METHODS, Collection
 from torchqm.matching.prepared import match_prepared
 from torchqm.matching.result import MatchResult
 from torchqm.matching.shape import PreparedShape
