@@ -328,6 +328,19 @@ def layers(data: dict[str, Any]) -> str:
     )
 
 
+def geodesics(data: dict[str, Any]) -> str:
+    """What sharing a factorisation gains, and farthest points by pruned fronts."""
+    case = next(c for c in data["cases"] if c["n_verts"] > 50000)
+    march, heat = case["solvers"]["fast_marching"], case["solvers"]["heat"]
+    most = max(data["cases"][-1]["farthest_points"].items(), key=lambda item: int(item[0]))
+    return (
+        f"Geodesics, `{data['command']}`, one thread: {data['calls']} calls of three rows on {case['n_verts']:,} vertices take "
+        f"{march['calls_shared']:.1f} s by fast marching (each with a set-up of its own: {march['calls_anew']:.1f} s) and "
+        f"{heat['calls_shared']:.1f} s by the heat method ({heat['calls_anew']:.1f} s); {int(most[0]):,} farthest points of "
+        f"{data['cases'][-1]['n_verts']:,} vertices {most[1]['fronts']:.1f} s (by whole runs {most[1]['whole_runs']:.1f} s)."
+    )
+
+
 def comparison(folder: Path) -> str:
     """Means of `torchqm benchmark` on TOSCA over the pairs that all methods solved, a row a method, and its figures."""
     run = json.loads((folder / "run.json").read_text())["arguments"]
@@ -365,10 +378,10 @@ def comparison(folder: Path) -> str:
         )
     common = next(cells["map"][5].split()[1].strip("()") for cells in found.values() if "map" in cells)
     return (
-        f"Comparison on TOSCA's published pairs but michael's, `{command}`: mean geodesic error / sqrt(area) over the {common} pairs that "
+        f"Comparison on TOSCA's published pairs, all classes, `{command}`: mean geodesic error / sqrt(area) over the {common} pairs that "
         "all methods solved (axes are not known of gorillas), against the plain truth, the better of the two truths for the whole "
         "map (Figure 10), point by point up to symmetry (Figure 6), and of each shape's symmetry (Figure 8); share of points below 0.05 "
-        "by the second, and median seconds, those of symmetries included, eigenfunctions not; two runs at a time on a busy machine. All numbers: "
+        "by the second, and median seconds, those of symmetries included, eigenfunctions not; one pair at a time with one thread, on a machine that had other work, too. All numbers: "
         "`benchmarks/results/comparison/`.\n\n" + "\n".join(rows) + "\n\n"
         "![Cumulative errors, the better of direct and mirrored truth for the whole map](docs/comparison_map.png)\n"
         "![Cumulative errors, point by point up to symmetry](docs/comparison_orbit.png)\n"
@@ -409,6 +422,7 @@ def main() -> int:
         "speed_eigenpairs": eigenpairs,
         "speed_match": whole_pair,
         "speed_growth": growth,
+        "speed_geodesics": geodesics,
         "learning": learning,
     }
     for name, make in single.items():
