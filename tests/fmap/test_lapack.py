@@ -41,12 +41,28 @@ def test_none_at_all():
 
 @pytest.mark.parametrize(
     "given",
-    [systems(4, 5)[::2], systems(2, 5).mT[:, :4], systems(2, 5)[0], systems(2, 5).half(), systems(2, 5).to("meta")],
-    ids=["strided", "not square", "no batch", "half", "elsewhere"],
+    [
+        systems(4, 5)[::2],
+        systems(2, 5).mT[:, :4],
+        systems(2, 5)[0],
+        systems(2, 5).half(),
+        systems(2, 5).to("meta"),
+        torch._neg_view(systems(2, 5)),
+    ],
+    ids=["strided", "not square", "no batch", "half", "elsewhere", "negated"],
 )
 def test_memory_that_lapack_would_misread_is_refused(given):
     with pytest.raises(ValueError, match="systems: "):
         unchecked(potrf)(given)
+
+
+def test_autograd_sees_that_memory_has_changed():
+    given = systems(1, 3).requires_grad_()
+    square = given * 1
+    total = square.square().sum()
+    potrf(square.detach())
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        total.backward()
 
 
 @pytest.mark.parametrize("capsules", [{}, {"spotrf": None, "dpotrf": None}], ids=["missing", "of another signature"])

@@ -203,3 +203,22 @@ def test_few_candidates_are_left_on_a_real_embedding(monkeypatch):
     )
     nearest_rows(queries, points)
     assert sum(seen) < 0.02 * len(points)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_many_candidates_are_told_apart_as_few_are(seed):
+    """Columns of very different scale: hundreds of points are equally near in single precision."""
+    generator = np.random.default_rng(seed)
+    points, queries = (
+        generator.standard_normal((n, 8)) * 10.0 ** generator.integers(-20, 20, (1, 8)) for n in (438, 363)
+    )
+    apart = [query - points for query in queries]
+    wanted = np.array([np.einsum("nd,nd->n", a, a).argmin() for a in apart])
+    found = nearest_rows(torch.from_numpy(queries), torch.from_numpy(points))
+    assert np.array_equal(found.numpy(), wanted)
+
+
+@pytest.mark.parametrize(("dtype", "size"), [(torch.float32, 3e38), (torch.float16, 3e4), (torch.float64, 1e308)])
+def test_coordinates_whose_sum_is_too_large(dtype, size):
+    points = torch.tensor([[size, 0.0], [-size, 0.0], [size, size]], dtype=dtype)
+    assert nearest_rows(points, points).tolist() == [0, 1, 2]

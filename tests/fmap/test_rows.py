@@ -6,6 +6,7 @@ import sys
 import pytest
 import torch
 from references.unchecked import unchecked
+from torch.autograd import forward_ad
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -109,6 +110,55 @@ def test_all_threads_together_keep_to_the_chunk(row_chunk, threads, threads_of_t
     for n, rows in asked:
         assert n * rows <= row_chunk
         assert n == min(threads, row_chunk)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_in_inference_mode(threads, threads_of_torch):
+    threads_of_torch(threads)
+    inputs = problem(2, kx=6, ky=9)
+    expected = solve(*inputs)
+    with torch.inference_mode():
+        assert torch.equal(solve(*(tensor.clone() for tensor in inputs)), expected)
+
+
+def test_on_the_cpu_whatever_the_default_device():
+    inputs = problem(2)
+    expected = solve(*inputs)
+    with torch.device("meta"):
+        assert torch.equal(solve(*inputs), expected)
+
+
+@pytest.mark.parametrize("which", range(3))
+def test_derivatives_in_forward_mode(which):
+    a, diagonal, rhs = problem(2)
+    inputs = [a @ a.mT, diagonal, rhs]
+    moves = [torch.randn(t.shape, dtype=t.dtype, generator=torch.Generator().manual_seed(8)) for t in inputs]
+    moves[0] = moves[0] + moves[0].mT
+    steps = [inputs.copy(), inputs.copy()]
+    for step, sign in zip(steps, (1, -1), strict=True):
+        step[which] = step[which] + sign * 1e-6 * moves[which]
+    expected = (solve_rows(*steps[0]) - solve_rows(*steps[1])) / 2e-6
+    with forward_ad.dual_level():
+        moving = inputs.copy()
+        moving[which] = forward_ad.make_dual(inputs[which], moves[which])
+        found = forward_ad.unpack_dual(solve_rows(*moving)).tangent
+    torch.testing.assert_close(found, expected, atol=1e-7, rtol=1e-6)
+
+
+def test_traced_and_run_with_other_numbers():
+    a, diagonal, rhs = problem(2)
+    traced = torch.jit.trace(solve_rows, (a @ a.mT, diagonal, rhs), check_trace=False)
+    other = problem(2, seed=1)
+    given = (other[0] @ other[0].mT, *other[1:])
+    assert torch.equal(traced(*given), solve_rows(*given))
+
+
+def test_what_is_below_the_diagonal_is_not_used():
+    a, diagonal, rhs = problem(2)
+    gram = a @ a.mT
+    assert torch.equal(
+        solve_rows(gram.triu() + 100 * torch.ones_like(gram).tril(-1), diagonal, rhs), solve_rows(gram, diagonal, rhs)
+    )
 
 
 def test_a_small_problem_starts_no_threads(threads_of_torch, monkeypatch):

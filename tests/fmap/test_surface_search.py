@@ -112,3 +112,16 @@ class TestSurfaceSearch:
         found = search.nearest(queries, everything)
         assert torch.equal(found, torch.stack([((everything - q) ** 2).sum(1).argmin() for q in queries]))
         assert 0 < int((found < 642).sum()) < 642
+
+
+def test_coordinates_that_it_cannot_compare_are_refused():
+    line = torch.arange(40.0, dtype=torch.float64)[:, None]
+    search = SurfaceSearch.build(line, torch.arange(0, 40, 4), m=6)
+    for place, value in ((1, torch.nan), (0, torch.inf)):  # vertex 1 is no anchor
+        bad = line.clone()
+        bad[place] = value
+        for queries, points in ((bad, line), (line, bad)):
+            with pytest.raises(ValueError, match="must be finite"):
+                search.nearest(queries, points, search)
+    with pytest.raises(ValueError, match="too large for single precision"):
+        search.nearest(line * 1e25, line * 1e25)

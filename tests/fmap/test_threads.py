@@ -2,6 +2,7 @@
 
 from functools import partial
 from threading import Barrier, Event, Thread, get_ident
+from time import sleep
 
 import pytest
 import torch
@@ -151,6 +152,33 @@ def test_two_threads_of_python_inside_at_the_same_time():
     assert seen == [{1}, 2]
     assert blas() == outside
     assert torch.get_num_threads() == 2
+
+
+def test_new_threads_have_as_many_as_before_when_the_last_has_left():
+    """Torch's number is copied by new threads: the second to come must not take the first one's for its own."""
+    inside, entered, seen = [], [Event(), Event()], []
+
+    def first():
+        with one_thread():
+            entered[0].set()
+            entered[1].wait(20)
+
+    def second():
+        entered[0].wait(20)
+        with one_thread():
+            inside.append(workers())
+            entered[1].set()
+            sleep(0.1)
+
+    threads = [Thread(target=run) for run in (first, second)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    new = Thread(target=lambda: seen.append(torch.get_num_threads()))
+    new.start()
+    new.join(20)
+    assert (inside, seen) == ([2], [2])
 
 
 def test_also_in_a_thread_that_is_not_the_main_one():

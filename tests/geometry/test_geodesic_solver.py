@@ -2,12 +2,15 @@
 
 import gc
 import weakref
+from threading import Event, Thread
+from time import sleep
 
 import pytest
 import torch
 import trimesh
 
 import torchqm.geometry.geodesic_solver as module
+import torchqm.geometry.geodesic_surface as surface_module
 from torchqm.geometry import GeodesicSolver, Mesh, distances
 
 METHODS = list(module.METHODS)
@@ -107,3 +110,29 @@ def test_every_call_on_a_mesh_that_cannot_be_marched_on_warns():
 def test_an_unknown_method_is_refused():
     with pytest.raises(ValueError, match="method is 'euclid'; allowed are 'fast_marching', 'heat'"):
         GeodesicSolver(sphere(1), "euclid")
+
+
+def test_a_mesh_that_was_written_into_gets_a_new_solver():
+    mesh = Mesh.from_arrays([[0, 0, 0], [2, 0, 0], [0, 1, 0], [2, 1, 0]], [[0, 1, 2], [1, 3, 2]])
+    before = distances(mesh, [0])
+    mesh.verts.mul_(3)
+    torch.testing.assert_close(distances(mesh, [0]), 3 * before)
+
+
+def test_threads_that_come_while_the_triangles_are_oriented_wait(monkeypatch):
+    entered, inner = Event(), surface_module.inspect_mesh
+
+    def slow(mesh):
+        entered.set()
+        sleep(0.1)
+        return inner(mesh)
+
+    monkeypatch.setattr(surface_module, "inspect_mesh", slow)
+    verts, faces = trimesh.creation.icosphere(1).vertices, trimesh.creation.icosphere(1).faces
+    surface = surface_module.Surface(Mesh.from_arrays(verts, faces[:, ::-1]))
+    first = Thread(target=lambda: surface.why_not_marching)
+    first.start()
+    assert entered.wait(10)
+    _, n = surface.marching_solver()  # raised, while another thread was at it
+    first.join()
+    assert n == len(verts)

@@ -21,7 +21,7 @@ def factorize(gram: Tensor, diagonal: Tensor, out: Tensor) -> Tensor:
     """Factors U, ``U^T U = gram + diag(diagonal)``, into the upper triangles of ``out``; which of them there are not.
 
     Args:
-        gram: ``(n, K, K)``.
+        gram: ``(n, K, K)``; what is below its diagonal is not used.
         diagonal: ``(R, n, K)``.
         out: ``(R, n, K, K)``, contiguous; what it holds below its diagonals afterwards means nothing.
     """
@@ -57,7 +57,8 @@ def surely_regular(gram: Tensor, floor: Tensor) -> bool:
     if not bool(torch.isfinite(least).all() & (unit > 0).all()):
         return False
     root = unit.rsqrt()
-    values = torch.linalg.eigvalsh(root[..., :, None] * least * root[..., None, :])
+    # The same triangle that is factored.
+    values = torch.linalg.eigvalsh(root[..., :, None] * least * root[..., None, :], UPLO="U")
     return bool((values[..., 0] > 4 * _noise(gram)).all())
 
 

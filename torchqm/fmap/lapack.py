@@ -46,18 +46,20 @@ def potrf(systems: Float[Tensor, "N K K"]) -> Int[Tensor, " N"]:
         >>> potrf(systems).tolist(), systems.triu().tolist()
         ([0], [[[2.0, 1.0], [0.0, 2.0]]])
     """
-    n, k = systems.shape[:2]
-    if systems.shape != (n, k, k) or not systems.is_contiguous():
+    n, k = map(int, systems.shape[:2])
+    if systems.shape != (n, k, k) or not systems.is_contiguous() or systems.is_neg():
         raise ValueError(f"systems: contiguous (N, K, K) is allowed, got {tuple(systems.shape)}, {systems.stride()}")
     call = _potrf(systems.dtype) if systems.device.type == "cpu" else None
     if call is None:
         raise ValueError(f"systems: {systems.dtype} on {systems.device} has no LAPACK here")
-    info, size = torch.zeros(n, dtype=torch.int32), ctypes.c_int(k)
+    info, size = torch.zeros(n, dtype=torch.int32, device="cpu"), ctypes.c_int(k)
     k_at, stride = ctypes.addressof(size), k * k * systems.element_size()
     at, info_at = systems.data_ptr(), info.data_ptr()
     # Row by row in memory is column by column in LAPACK: its lower triangle is our upper one.
     for i in range(n if k else 0):
         call(b"L", k_at, at + i * stride, k_at, info_at + 4 * i)
+    if not systems.is_inference():
+        torch.autograd.graph.increment_version(systems)  # else autograd would not see that they changed
     return info
 
 

@@ -4,14 +4,13 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
-import scipy
 import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from torchqm.fmap.threads import in_parallel, workers
 
-__all__ = ["nearest_rows", "rounding_bound", "settled"]
+__all__ = ["nearest_rows", "require_finite_coordinates", "rounding_bound", "settled"]
 
 _ROWS, _COLUMNS = 256, 8192  # of a block of products: 8 MiB for each worker, whatever the number of points
 _MANY = 256  # candidates for each query of a block from which on all its distances are computed
@@ -43,9 +42,16 @@ def nearest_rows(queries: Float[Tensor, "Q D"], points: Float[Tensor, "P D"], ex
         raise ValueError(f"queries have {queries.shape[1]} coordinates, points have {points.shape[1]}")
     if points.shape[0] == 0:
         raise ValueError("points: there are none to choose from")
-    if not bool(torch.isfinite(queries.sum() + points.sum())):  # NaN and infinities survive a sum
-        raise ValueError("queries and points must be finite; a spectral coordinate is NaN or infinite")
+    queries, points = (v if v.dtype in (torch.float32, torch.float64) else v.double() for v in (queries, points))
+    require_finite_coordinates(queries, points)
     return torch.from_numpy(_blocked(queries.detach().numpy(), points.detach().numpy(), exact=exact))
+
+
+def require_finite_coordinates(queries: Float[Tensor, "Q D"], points: Float[Tensor, "P D"]) -> None:
+    """ValueError where a coordinate is NaN or infinite: both survive a sum, which otherwise is seldom too large."""
+    for values in (queries, points):
+        if not bool(torch.isfinite(values.sum())) and not bool(torch.isfinite(values).all()):
+            raise ValueError("queries and points must be finite; a spectral coordinate is NaN or infinite")
 
 
 def rounding_bound(queries: np.ndarray, points: np.ndarray, d: int) -> np.ndarray:
@@ -243,13 +249,19 @@ def _look(part: _Range, block: np.ndarray, reach: np.ndarray, points: np.ndarray
         good = np.flatnonzero(out >= enough[:, None])  # twice as quick as nonzero of a matrix
         if len(good) > _MANY * len(queries):
             row = np.arange(len(queries))
-            column = scipy.spatial.distance.cdist(part.given[i : i + rows], points, "sqeuclidean").argmin(1)
+            column = np.array([_first_nearest(query, points) for query in part.given[i : i + rows]])
         else:
             row, column = np.divmod(good, out.shape[1])
         value = out[row, column]
         own = rounding_bound(norms[row], reach[column], d)
         np.maximum.at(low, row, value - own)
         part.add(row + i, column + start, value + own, value + own >= low[row])
+
+
+def _first_nearest(query: np.ndarray, points: np.ndarray) -> int:
+    """By the same sum as in :func:`settled`, to the last bit."""
+    apart = np.subtract(query, points, dtype=np.float64)
+    return int(np.einsum("nd,nd->n", apart, apart).argmin())
 
 
 def _decide(part: _Range, points: np.ndarray) -> Shaped[np.ndarray, " n"]:

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 
 from torchqm.checks import Sizes, enabled, wanted
 from torchqm.fmap.cholesky import factorize, rows_at_once, solve_checked, solve_factored, surely_regular
@@ -67,7 +68,7 @@ def solve_rows(
     ``gram``. It is made of differentiable operations: derivatives of any order are right.
 
     Args:
-        gram: ``(..., Kx, Kx)`` symmetric; the upper triangle is not read.
+        gram: ``(..., Kx, Kx)`` symmetric; the lower triangle is not used.
         diagonal: ``(..., Ky, Kx)`` added to the diagonal of ``gram``, for each row.
         rhs: ``(..., Ky, Kx)`` right-hand sides.
         row_chunk: keep no factor, and let at most so many rows of all samples be in memory at once: ``(..., row_chunk,
@@ -95,11 +96,24 @@ def solve_rows(
         raise ValueError(f"row_chunk is {row_chunk}; allowed are None and whole numbers from 1")
     tracked = gram.requires_grad or diagonal.requires_grad or rhs.requires_grad
     keep = row_chunk is None and tracked and torch.is_grad_enabled()
-    if enabled() and not tracked and all(type(t) is Tensor for t in (gram, diagonal, rhs)):
-        # Nobody compiles, traces or differentiates. Called as an operator for the first time, it would load the
+    if enabled() and not tracked and _plain(gram, diagonal, rhs):
+        # Nobody differentiates either. Called as an operator for the first time, it would load the
         # compiler, which takes longer than the match of a pair.
         return _rows_and_factor(gram, diagonal, rhs, row_chunk or 0, False, True)[0]
-    return _Solve.apply(gram, diagonal, rhs, row_chunk or 0, keep, wanted())[0]
+    moving = not torch.compiler.is_compiling() and any(map(_has_tangent, (gram, diagonal, rhs)))
+    solve = _SolveForward if moving else _Solve
+    return solve.apply(gram, diagonal, rhs, row_chunk or 0, keep, wanted())[0]
+
+
+def _plain(*tensors: Tensor) -> bool:
+    """Whether nobody compiles or traces, and none has a tangent."""
+    if torch.compiler.is_compiling() or torch.jit.is_tracing():
+        return False
+    return all(type(tensor) is Tensor and not _has_tangent(tensor) for tensor in tensors)
+
+
+def _has_tangent(tensor: Tensor) -> bool:
+    return unpack_dual(tensor).tangent is not None
 
 
 def _rows_and_factor(
@@ -200,6 +214,7 @@ class _Solve(torch.autograd.Function):
         ctx.mark_non_differentiable(output[1])
         ctx.set_materialize_grads(False)  # else autograd makes zeros as large as the factor
         ctx.save_for_backward(gram, diagonal, *output)
+        ctx.save_for_forward(gram, diagonal, *output)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor | None, _: Any) -> tuple[Tensor | None, ...]:
@@ -231,6 +246,22 @@ class _SolveAgain(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         gram, diagonal, rows, factor = ctx.saved_tensors
         return *_gradients(rows, _SolveAgain.apply(gram, diagonal, grad, factor)), None
+
+
+class _SolveForward(_Solve):
+    """Also with derivatives in forward mode; ``torch.compile`` takes no function that has these."""
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor, None]:
+        # S_i dc_i = drhs_i - (dgram + diag(ddiagonal_i)) c_i
+        gram, diagonal, rows, _ = ctx.saved_tensors
+        gram_t, diagonal_t, rhs_t = tangents[:3]
+        moved = torch.zeros_like(rows) if rhs_t is None else rhs_t
+        if gram_t is not None:
+            moved = moved - rows @ (gram_t + gram_t.mT) / 2
+        if diagonal_t is not None:
+            moved = moved - diagonal_t * rows
+        return _SolveForward.apply(gram, diagonal, moved, ctx.row_chunk, False, False)[0], None
 
 
 def _gradients(rows: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:

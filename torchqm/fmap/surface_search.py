@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from torchqm.fmap.nearest import nearest_rows, rounding_bound, settled
+from torchqm.fmap.nearest import nearest_rows, require_finite_coordinates, rounding_bound, settled
 from torchqm.fmap.threads import in_parallel, workers
 
 __all__ = ["SurfaceSearch"]
@@ -76,8 +76,10 @@ class SurfaceSearch:
                 anchors are compared with all anchors here, the others with the partners of the anchors close to them.
 
         Raises:
-            ValueError: the guide is of a surface with another number of vertices.
+            ValueError: the guide is of a surface with another number of vertices, or a coordinate is NaN, infinite or
+                too large for single precision.
         """
+        require_finite_coordinates(queries, points)
         given, everything = queries.detach().numpy(), points.detach().numpy()
         chosen = everything[self.anchors.numpy()]
         # What all coordinates have in common is taken off before it costs digits in single precision.
@@ -115,7 +117,10 @@ def _around(
         ``(Q,)`` points, ``(N,)`` doubtful queries and for each of these a candidate; each doubtful one has all of its
         candidates there.
     """
-    half = np.einsum("vk,vk->v", points, points) / 2
+    with np.errstate(over="ignore"):
+        half = np.einsum("vk,vk->v", points, points) / 2
+    if not np.isfinite(half.sum()):
+        raise ValueError("points: coordinates are too large for single precision; scale the shapes to area 1")
     norms, reach, d = np.sqrt(np.einsum("qk,qk->q", queries, queries)), np.sqrt(2 * half), points.shape[1]
     order = np.argsort(stage, kind="stable")
     anchors, starts, counts = np.unique(stage[order], return_index=True, return_counts=True)

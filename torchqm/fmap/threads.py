@@ -27,16 +27,19 @@ class _Blas:
     """
 
     def __init__(self) -> None:
-        self._lock, self._users = Lock(), 0
+        self._lock, self._users, self._torch = Lock(), 0, 1
         self._limits: Any = None
 
-    def take(self) -> None:
+    def take(self) -> int:
+        """Limit it; returns how many threads torch has outside (each thread its own; new ones copy the last)."""
         with self._lock:
             if not self._users:
+                self._torch = torch.get_num_threads()
                 with _right_to_set():
                     # Selected, so that only these are restored: OpenMP's number is torch's and each thread's own.
                     self._limits = ThreadpoolController().select(user_api="blas").limit(limits=1)
             self._users += 1
+            return self._torch
 
     def give_back(self) -> None:
         with self._lock:
@@ -75,9 +78,8 @@ def one_thread() -> Iterator[None]:
     if _BEFORE.get():  # one inside another, or a task of a worker
         yield
         return
-    before = torch.get_num_threads()
+    before = _BLAS.take()
     tokens = _WORKERS.set(max(before, _WORKERS.get())), _BEFORE.set(before)
-    _BLAS.take()
     torch.set_num_threads(1)
     try:
         yield
@@ -159,12 +161,12 @@ def in_shares(run: Callable[[Sequence[Item]], None], items: Sequence[Item], n: i
         >>> found.tolist()
         [0.0, 2.0, 4.0, 6.0]
     """
-    before, n = torch.get_num_threads(), min(n, len(items))
+    before, n, inference = torch.get_num_threads(), min(n, len(items)), torch.is_inference_mode_enabled()
 
-    @torch.no_grad()
     def share(items: Sequence[Item]) -> None:
         torch.set_num_threads(1)  # of this thread; of those that start later, too, hence again below
-        run(items)
+        with torch.inference_mode(inference), torch.no_grad():  # what each thread has of its own
+            run(items)
 
     if n <= 1:
         run(items)

@@ -45,18 +45,19 @@ class GeodesicSolver:
         if method not in METHODS:
             raise ValueError(f"method is {method!r}; allowed are {', '.join(map(repr, METHODS))}")
         self.method, self.n_verts, self.label = method, mesh.n_verts, mesh.label
+        self.state = _state(mesh)
         self._surface = Surface(mesh)
 
     @classmethod
     def kept(cls, mesh: Mesh, method: str = "fast_marching") -> "GeodesicSolver":
-        """The solver that an earlier call made for this very mesh, else a new one.
+        """The solver that an earlier call made for this very mesh as it is, else a new one.
 
         Those of the last :data:`KEEP` meshes are kept, as long as the mesh itself is there; of each the method that was
         asked for last (a heat solver of 52k vertices holds 170 MB).
         """
         with _LOCK:
             solver = _KEPT.pop(mesh, None)
-        if solver is None or solver.method != method:
+        if solver is None or solver.method != method or solver.state != _state(mesh):
             solver = cls(mesh, method)
         with _LOCK:
             _KEPT[mesh] = solver
@@ -104,6 +105,11 @@ class GeodesicSolver:
     @cached_property
     def _from_source(self) -> "_FromSource":
         return _SET_UP[self.used](self._surface)
+
+
+def _state(mesh: Mesh) -> tuple[int, ...]:
+    """Counts what was written into the tensors of a mesh; of inference tensors nobody keeps count."""
+    return tuple(-1 if tensor.is_inference() else tensor._version for tensor in (mesh.verts, mesh.faces))
 
 
 KEEP = 2

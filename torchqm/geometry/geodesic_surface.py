@@ -1,5 +1,6 @@
 """The part of a mesh that geodesic solvers see, and what they need of it."""
 
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -29,9 +30,8 @@ class Surface:
         self.scale = float(np.abs(verts).max(initial=0.0)) or 1.0
         self.verts = np.ascontiguousarray(verts / self.scale)
         self.n = len(self.ids)
-        self._oriented: np.ndarray | None = None
-        self._why_not: str | None = None
-        self._known = False
+        self._found: tuple[np.ndarray | None, str | None] | None = None
+        self._lock = Lock()  # several threads may share what is kept for a mesh
 
     @property
     def compact(self) -> Mesh:
@@ -41,33 +41,40 @@ class Surface:
     @property
     def why_not_marching(self) -> str | None:
         """Why fast marching cannot run here, or None."""
-        if not self._known:
-            self._known = True
-            report = inspect_mesh(self.compact) if self.n else None
-            if report is not None and not report.manifold:
-                self._why_not = (
-                    f"fast marching needs a manifold ({report.n_nonmanifold_edges} non-manifold edges, "
-                    f"{report.n_nonmanifold_verts} non-manifold vertices)"
-                )
-            elif report is not None and report.oriented:
-                self._oriented = self.faces
-            else:
-                oriented = orient_faces(self.compact)
-                self._oriented = None if oriented is None else oriented.numpy()
-                if oriented is None:
-                    self._why_not = "fast marching needs an orientable surface"
-        return self._why_not
+        return self._marching[1]
+
+    @property
+    def _marching(self) -> tuple[np.ndarray | None, str | None]:
+        """Oriented triangles, or why there are none."""
+        with self._lock:
+            if self._found is None:
+                self._found = self._orient()
+            return self._found
+
+    def _orient(self) -> tuple[np.ndarray | None, str | None]:
+        report = inspect_mesh(self.compact) if self.n else None
+        if report is None:
+            return None, None
+        if not report.manifold:
+            return None, (
+                f"fast marching needs a manifold ({report.n_nonmanifold_edges} non-manifold edges, "
+                f"{report.n_nonmanifold_verts} non-manifold vertices)"
+            )
+        if report.oriented:
+            return self.faces, None
+        oriented = orient_faces(self.compact)
+        return (None, "fast marching needs an orientable surface") if oriented is None else (oriented.numpy(), None)
 
     def marching_solver(self) -> tuple[Any, int]:
         """A potpourri3d solver, and how many of its vertices are real (the first ones)."""
         import potpourri3d
 
-        if self.why_not_marching is not None or self._oriented is None:
-            raise ValueError(f"{self.label}: {self.why_not_marching}")
+        faces, why_not = self._marching
+        if faces is None:
+            raise ValueError(f"{self.label}: {why_not or 'it has no triangles'}")
         # potpourri3d 1.4 never walks along a boundary edge against its only half-edge, which makes distances near a
         # boundary too long. A flap on every boundary edge, the parallelogram point of its triangle, gives it the other
         # half-edge; a path over the flap is longer than the edge itself, so no distance gets shorter.
-        faces = self._oriented
         keys = faces * self.n + faces[:, [1, 2, 0]]
         twins = faces[:, [1, 2, 0]] * self.n + faces
         face, corner = np.nonzero(~np.isin(keys, twins))
