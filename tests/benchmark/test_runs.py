@@ -34,7 +34,7 @@ def test_a_file_of_one_run_becomes_the_first_of_several(tmp_path):
     assert len(read(tmp_path)["runs"]) == 2
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "3"])
+@pytest.mark.parametrize("text", ["", "{", "[]", "3", '{"runs": 3}', '{"runs": ["x"]}'])
 def test_a_damaged_file_stops_nothing(tmp_path, text):
     (tmp_path / "run.json").write_text(text)
     begin_run(tmp_path, {"a": 1}, {})

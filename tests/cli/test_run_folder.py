@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from filelock import FileLock
 from pytorch_lightning.loggers import CSVLogger, TensorBoardLogger
 
 from torchqm.cli.console import UserError
@@ -181,6 +182,15 @@ def test_a_process_that_is_killed_in_the_midst_of_an_epoch(folder, watch, tmp_pa
     assert (run / "config.yaml").read_bytes() == text
     (run / "config.yaml").write_bytes((watch / "config.yaml").read_bytes())  # differs in save_dir alone
     assert_equal_runs(run, watch)
+
+
+def test_two_trainings_do_not_share_a_folder(folder, watch, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(folder / "runs" / "version_0", run)
+    before = contents(run)
+    with FileLock(run / ".lock"), pytest.raises(UserError, match="run: another training is writing there"):
+        fit(["--resume", str(run), "--trainer.max_epochs", str(EPOCHS + 1)])
+    assert contents(run) == before
 
 
 def contents(run):

@@ -1,5 +1,6 @@
 import json
 import pickle
+import re
 
 import pytest
 import torch
@@ -88,6 +89,47 @@ def test_a_changed_weight_is_noticed(tmp_path):
     content[-40] ^= 1
     with pytest.raises(ValueError, match=r"flipped\.safetensors: damaged: its weights are not those"):
         load_net(damaged(tmp_path / "flipped.safetensors", bytes(content)))
+
+
+def test_bytes_that_changed_in_a_checkpoint_are_noticed(run, tmp_path):
+    """Also where the pickle is whole and torch reads it: in the numbers of a weight."""
+    content = bytearray((run[0] / "checkpoints" / "last.ckpt").read_bytes())
+    weights = max(run[1].net.state_dict().values(), key=torch.numel).numpy().tobytes()
+    at = bytes(content).index(weights)
+    content[at : at + 4] = bytes(255 - byte for byte in content[at : at + 4])
+    path = tmp_path / "flipped.ckpt"
+    path.write_bytes(content)
+    torch.load(path, weights_only=True)
+    with pytest.raises(ValueError, match=r"flipped\.ckpt: damaged, .* is not what was written"):
+        load_net(path)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_weights_that_are_no_numbers_are_refused(value, run, tmp_path):
+    net = net_of()
+    name, parameter = next(iter(net.named_parameters()))
+    parameter.data.view(-1)[0] = value
+    with pytest.raises(ValueError, match=rf"net\.safetensors: weights that are NaN or infinite: {re.escape(name)}"):
+        load_net(save_net(net, tmp_path / "net.safetensors"))
+    content = torch.load(run[0] / "checkpoints" / "last.ckpt", weights_only=True)
+    content["state_dict"][f"net.{name}"].view(-1)[0] = value
+    torch.save(content, tmp_path / "net.ckpt")
+    with pytest.raises(ValueError, match=rf"net\.ckpt: weights that are NaN or infinite: net\.{re.escape(name)}"):
+        load_net(tmp_path / "net.ckpt")
+
+
+def test_of_several_good_checkpoints_the_best(run, tmp_path):
+    """Not the one of the highest epoch: the last checkpoint remembers which, wherever the folder is now."""
+    folder = tmp_path / "moved" / "checkpoints"
+    folder.mkdir(parents=True)
+    for path in (run[0] / "checkpoints").iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    content = torch.load(folder / "last.ckpt", weights_only=True)
+    content["callbacks"] = {"Other": {}, "Best": {"best_model_path": "/elsewhere/checkpoints/best-epoch=9.ckpt"}}
+    torch.save(content, folder / "last.ckpt")
+    assert find_weights(tmp_path / "moved") == folder / "best-epoch=9.ckpt"
+    (folder / "best-epoch=9.ckpt").unlink()
+    assert find_weights(tmp_path / "moved") == folder / "best-epoch=10.ckpt"
 
 
 def test_a_file_that_knows_fewer_options_is_read_with_their_defaults(tmp_path):

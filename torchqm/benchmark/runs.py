@@ -61,7 +61,10 @@ def _read(out: Path) -> dict[str, Any]:
         found = {}
     if not isinstance(found, dict):
         found = {}
-    if "runs" in found:
-        return {"arguments": found.get("arguments", {}), "runs": list(found["runs"])}
-    # Before 0.1.0 was finished the file held one run alone.
-    return {"arguments": found.get("arguments", {}), "runs": [{"results": None, **found}] if found else []}
+    runs = found.get("runs")
+    if runs is None:  # the file of a version that kept one run alone
+        runs = [{"results": None, **found}] if found else []
+    return {
+        "arguments": found.get("arguments", {}),
+        "runs": [run for run in runs if isinstance(run, dict)] if isinstance(runs, list) else [],
+    }

@@ -4,11 +4,12 @@ import sys
 import warnings
 from argparse import ArgumentError
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import yaml
+from filelock import FileLock, Timeout
 from pytorch_lightning import Callback, Trainer
 from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
@@ -20,6 +21,7 @@ from torchqm.cli.run_folder import Place, RunConfig, place_of_test, place_of_tra
 from torchqm.data.datamodule import PairDataModule
 from torchqm.learn.callbacks import BestCheckpoint, LastEpoch, Versions
 from torchqm.learn.faults import StepError
+from torchqm.learn.logger import RunLogger
 from torchqm.learn.module import MatchModule
 from torchqm.learn.options import NetOptions
 from torchqm.learn.state import TrainingState, check_state
@@ -48,8 +50,10 @@ class MatchCLI(LightningCLI):
     in its own folder, a test writes into a folder of its own, and a checkpoint is looked at first.
     """
 
-    def __init__(self, *args: Any, resumed: Path | None = None, words: Sequence[str] = (), **kwargs: Any) -> None:
-        self._resumed, self._words = resumed, words
+    def __init__(
+        self, *args: Any, held: ExitStack, resumed: Path | None = None, words: Sequence[str] = (), **kwargs: Any
+    ) -> None:
+        self._held, self._resumed, self._words = held, resumed, words
         self._place: Place | None = None
         self._state: TrainingState | None = None
         super().__init__(*args, **kwargs)  # this does everything
@@ -64,10 +68,11 @@ class MatchCLI(LightningCLI):
         # Its own checkpoints, where a run goes on in its folder.
         warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")
         once = {"exit_on_error": False}
-        with shape_faults(), _stops():
+        with shape_faults(), _stops(), ExitStack() as held:
             return cls(
                 MatchModule,
                 PairDataModule,
+                held=held,
                 save_config_callback=RunConfig,
                 seed_everything_default=0,
                 args=args,
@@ -170,8 +175,22 @@ class MatchCLI(LightningCLI):
             if self.config_init[str(self.subcommand)]["ckpt_path"] is None:
                 self.model.begin()
             self.datamodule.setup("fit")
-        if self._place is not None and self.trainer.is_global_zero:
-            self._tell(self._place, self._state)
+        if self.trainer.is_global_zero:
+            self._lock()
+            if self._place is not None:
+                self._tell(self._place, self._state)
+
+    def _lock(self) -> None:
+        """Hold the folder until the end: two runs in it would write into each other's metrics and checkpoints."""
+        logger = next((logger for logger in self.trainer.loggers if isinstance(logger, RunLogger)), None)
+        if logger is None:
+            return
+        folder = Path(logger.log_dir)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._held.enter_context(FileLock(folder / ".lock", timeout=0))
+        except Timeout as error:
+            raise UserError(f"{folder}: another training is writing there") from error
 
     def _tell(self, place: Place, state: TrainingState | None) -> None:
         if place.folder is None:

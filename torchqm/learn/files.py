@@ -8,6 +8,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
+from zipfile import BadZipFile, ZipFile, is_zipfile
 
 import torch
 from torch import Tensor
@@ -109,6 +110,8 @@ def find_weights(path: str | Path) -> Path:
     path = Path(path)
     if path.is_dir():
         folder = path / "checkpoints" if (path / "checkpoints").is_dir() else path
+        if (best := _best_of(folder)) is not None:
+            return best
         for pattern in ("best*.ckpt", "last*.ckpt", "*.ckpt"):
             found = sorted(folder.glob(pattern), key=_natural)
             if found:
@@ -121,6 +124,21 @@ def find_weights(path: str | Path) -> Path:
     return path
 
 
+def _best_of(folder: Path) -> Path | None:
+    """The checkpoint that the last one remembers as the best; None if it does not, or it is not there any more."""
+    for last in sorted(folder.glob("last*.ckpt"), key=_natural)[::-1]:
+        try:
+            callbacks = read_checkpoint(last).get("callbacks", {})
+        except ValueError:  # to be told when it is used
+            continue
+        states = callbacks.values() if isinstance(callbacks, dict) else []
+        names = [state.get("best_model_path") for state in states if isinstance(state, dict)]
+        there = [folder / Path(str(name)).name for name in names if name]
+        if found := [path for path in there if path.is_file()]:
+            return found[0]
+    return None
+
+
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """What a Lightning checkpoint of a :class:`torchqm.learn.MatchModule` holds; nothing in it is ever executed.
 
@@ -128,13 +146,18 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         ValueError: it is damaged, or something else; the file is named.
     """
     try:
+        if is_zipfile(path):  # torch does not look at the sums that it wrote
+            with ZipFile(path) as archive:
+                damaged = archive.testzip()
+            if damaged is not None:
+                raise ValueError(f"{damaged} in it is not what was written")
         content = torch.load(path, map_location="cpu", weights_only=True)
     except UnpicklingError as error:
         # Of a pickle with other objects, and of what is no pickle at all. What torch says is how to execute it.
         found = re.search(r"(?:GLOBAL|global) (\w+(?:\.\w+)+)", str(error))
         what = f" ({found[1]})" if found else ""
         raise ValueError(f"{path}: damaged, or holds more than weights{what} and is not read") from error
-    except (OSError, RuntimeError, EOFError, KeyError, ValueError) as error:
+    except (OSError, RuntimeError, EOFError, KeyError, ValueError, BadZipFile) as error:
         raise ValueError(f"{path}: damaged, cut short or no checkpoint ({_short(error)})") from error
     needed = ("state_dict", "hyper_parameters")
     if not isinstance(content, dict) or any(not isinstance(content.get(name), dict) for name in needed):
@@ -143,7 +166,15 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise ValueError(
             f"{path}: no checkpoint of torchqm.learn.MatchModule: its hyperparameters are those of another"
         )
+    _require_finite(path, content["state_dict"])
     return content
+
+
+def _require_finite(path: Path, state: Mapping[str, Any]) -> None:
+    bad = [name for name, v in state.items() if isinstance(v, Tensor) and not bool(torch.isfinite(v).all())]
+    if bad:
+        more = f" and {len(bad) - 3} more" if len(bad) > 3 else ""
+        raise ValueError(f"{path}: weights that are NaN or infinite: {', '.join(bad[:3])}{more}")
 
 
 def differences(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor], shown: int = 4) -> str:
@@ -196,6 +227,7 @@ def _read(path: Path) -> _Read:
             raise ValueError(f"{path}: of format {about['format']!r}; this version of torchqm reads {FORMAT}")
     except (json.JSONDecodeError, TypeError, KeyError) as error:
         raise ValueError(f"{path}: safetensors, but no network of torchqm: its metadata has no options") from error
+    _require_finite(path, state)
     return options, state, about.get("digest")
 
 

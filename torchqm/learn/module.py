@@ -107,8 +107,8 @@ class MatchModule(LightningModule):
     ) -> None:
         super().__init__()
         for name, value in (("lr", lr), ("weight_decay", weight_decay)):
-            if not 0 <= value < float("inf"):
-                raise ValueError(f"{name}: {value} given, expected a number from 0 on")
+            if not 0 <= value <= 1e30:  # beyond it Adam's own numbers are none any more
+                raise ValueError(f"{name}: {value} given, expected a number from 0 to 1e30")
         inputs = list(inputs)  # a tuple would not come back from a file as one
         self.save_hyperparameters()
         options = NetOptions(**{field.name: self.hparams[field.name] for field in fields(NetOptions)})
