@@ -13,10 +13,13 @@ from pytorch_lightning import Callback, Trainer
 from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
-from torchqm.cli.config_errors import explained
+from torchqm.cli.agreement import check_monitor, check_truth, first_truths, without_truth
+from torchqm.cli.config_errors import explained, placed
 from torchqm.cli.console import UserError
 from torchqm.cli.inputs import shape_faults
+from torchqm.cli.learn import Interrupted
 from torchqm.cli.run_folder import Place, RunConfig, place_of_test, place_of_training, read_config
+from torchqm.data.base import TruthError
 from torchqm.data.datamodule import PairDataModule
 from torchqm.learn.callbacks import BestCheckpoint, LastEpoch, Versions
 from torchqm.learn.faults import StepError
@@ -63,7 +66,7 @@ class MatchCLI(LightningCLI):
         warnings.filterwarnings("ignore", message="You have overridden `transfer_batch_to_device`")
         # Its own checkpoints, where a run goes on in its folder.
         warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")
-        once = {"exit_on_error": False}
+        once = {"exit_on_error": False, "allow_abbrev": False}
         with shape_faults(), _stops():
             return cls(
                 MatchModule,
@@ -102,8 +105,7 @@ class MatchCLI(LightningCLI):
         except ArgumentError as error:
             given = [str(arg) for arg in args] if isinstance(args, list) else []
             known = getattr(self, "_subcommand_parsers", {}).get(given[0] if given else "", parser)
-            keys = sorted({*known.get_defaults().keys(), *(action.dest for action in known._actions)})
-            raise UserError(explained(error.message, keys, given)) from error
+            raise UserError(explained(error.message, _keys_of(known), given)) from error
 
     def _parse_ckpt_path(self) -> None:
         """Nothing: Lightning would put the options of a checkpoint, whatever file it is, before those of the config."""
@@ -114,7 +116,7 @@ class MatchCLI(LightningCLI):
         Raises:
             UserError: values that do not fit, or an empty data root.
         """
-        with _values():
+        with self._values():
             super().instantiate_classes()
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
@@ -123,6 +125,7 @@ class MatchCLI(LightningCLI):
         Raises:
             UserError: a checkpoint that is not there, damaged, or of another architecture.
         """
+        self._agree()
         if self.subcommand is None:
             return self._trainer(**kwargs)
         given = self.config_init[self.subcommand]
@@ -146,6 +149,33 @@ class MatchCLI(LightningCLI):
         given["ckpt_path"], given["weights_only"], self._place = place.checkpoint, True, place
         return self._trainer(**kwargs, logger=place.loggers)
 
+    def _agree(self) -> None:
+        """Find what would stop the first epoch, or the end of it."""
+        options = self.model.hparams
+        check_truth(self.datamodule.hparams["truth"], options["supervision"])
+        if self.subcommand != "test" and not self._get(self.config, "trainer.callbacks"):  # others log for themselves
+            check_monitor(self._get(self.config, "checkpoint.monitor"), options)
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        try:
+            super()._run_subcommand(subcommand)
+        except SystemExit as stop:
+            if stop.code != 1:  # Lightning's answer to an interrupt, after the callbacks have had their say
+                raise
+            folder = getattr(self.trainer.logger, "log_dir", None) if subcommand == "fit" else None
+            raise Interrupted(folder) from stop
+
+    @contextmanager
+    def _values(self) -> Iterator[None]:
+        """Values of a config that do not fit are the user's to put right; so is a package that is not there."""
+        try:
+            yield
+        except TruthError as error:
+            raise UserError(without_truth(error)) from error
+        except (ValueError, OSError, ImportError, MisconfigurationException) as error:
+            parser = self.parser if self.subcommand is None else self._parser(self.subcommand)
+            raise UserError(placed(str(error), _keys_of(parser), self._words)) from error
+
     def _trainer(self, **kwargs: Any) -> Trainer:
         try:
             return super().instantiate_trainer(**kwargs)
@@ -166,10 +196,16 @@ class MatchCLI(LightningCLI):
 
     def before_fit(self) -> None:
         """Open the shapes and read given weights, so that a fault of the config is told from one of the code."""
-        with _values():
+        with self._values():
             if self.config_init[str(self.subcommand)]["ckpt_path"] is None:
                 self.model.begin()
             self.datamodule.setup("fit")
+            first_truths(self.datamodule)
+            if self.datamodule.parts["validation"] is not None and self.trainer.limit_val_batches:
+                own = self._get(self.config_init, "trainer.callbacks")
+                truth = self.datamodule.hparams["truth"] != "none"
+                if not own:
+                    check_monitor(self._get(self.config, "checkpoint.monitor"), self.model.hparams, truth)
         if self._place is not None and self.trainer.is_global_zero:
             self._tell(self._place, self._state)
 
@@ -188,7 +224,7 @@ class MatchCLI(LightningCLI):
 
     def before_test(self) -> None:
         """Likewise."""
-        with _values():
+        with self._values():
             self.datamodule.setup("test")
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
@@ -208,17 +244,12 @@ class MatchCLI(LightningCLI):
         )
 
 
+def _keys_of(parser: Any) -> list[str]:
+    return sorted({*parser.get_defaults().keys(), *(action.dest for action in parser._actions)})
+
+
 def _keys(network: str, gradients: bool) -> list[str]:
     return list(NetOptions(network=network, gradients=gradients).keys)
-
-
-@contextmanager
-def _values() -> Iterator[None]:
-    """Values of a config that do not fit are the user's to put right; so is a package that is not there."""
-    try:
-        yield
-    except (ValueError, OSError, ImportError, MisconfigurationException) as error:
-        raise UserError(str(error)) from error
 
 
 @contextmanager
@@ -226,5 +257,7 @@ def _stops() -> Iterator[None]:
     """A run that cannot go on is told in one line; every other exception is a bug and keeps its traceback."""
     try:
         yield
+    except TruthError as error:
+        raise UserError(without_truth(error)) from error
     except (StepError, MisconfigurationException) as error:
         raise UserError(str(error)) from error
