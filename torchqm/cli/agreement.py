@@ -52,13 +52,13 @@ def check_truth(truth: str, supervision: str) -> None:
         )
 
 
-def first_truths(data: PairDataModule) -> None:
-    """Look at the truth of the first pair of each part, where it is required: of many sets no pair has one.
+def first_truths(data: PairDataModule, *parts: str) -> None:
+    """Look at the truth of the first pair of some parts, where it is required: of many sets no pair has one.
 
     Raises:
         TruthError: there is none.
     """
-    for part in data.parts.values():
+    for part in (data.parts[name] for name in parts):
         pairs = part.pairs if isinstance(part, SwappedTruths) else part
         if pairs is not None and pairs.truth_use == "required":
             pairs.items.shapes.truth(*pairs.pairs[0])

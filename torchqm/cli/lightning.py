@@ -200,7 +200,7 @@ class MatchCLI(LightningCLI):
             if self.config_init[str(self.subcommand)]["ckpt_path"] is None:
                 self.model.begin()
             self.datamodule.setup("fit")
-            first_truths(self.datamodule)
+            first_truths(self.datamodule, "train", "validation")
             if self.datamodule.parts["validation"] is not None and self.trainer.limit_val_batches:
                 own = self._get(self.config_init, "trainer.callbacks")
                 truth = self.datamodule.hparams["truth"] != "none"
@@ -226,6 +226,7 @@ class MatchCLI(LightningCLI):
         """Likewise."""
         with self._values():
             self.datamodule.setup("test")
+            first_truths(self.datamodule, "test")
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """What model and data must agree on is given once; checkpoints are kept by the orbit error."""
