@@ -21,7 +21,7 @@ def test_monitors_are_what_a_run_logs(tmp_path, supervision, truth):
 def test_a_monitor_that_nothing_logs_is_named_with_the_nearest():
     for name in (None, "epoch", "step", "val_l_align"):
         check_monitor(name, OPTIONS)
-    with pytest.raises(ValueError, match="monitor: 'val_los' given, .*; the nearest is val_loss"):
+    with pytest.raises(ValueError, match=r"monitor: 'val_los' given, .*; the nearest is val_loss"):
         check_monitor("val_los", OPTIONS)
     with pytest.raises(ValueError, match="monitor: 'val_l_truth' given"):
         check_monitor("val_l_truth", OPTIONS)

@@ -9,7 +9,7 @@ from torchqm.cli.learn import learn
     [
         ("{precision: 12}", "precision: '12' given, expected one of 64, 32, 16, .*16-mixed.* or null$"),
         ("{callbacks: [{class_path: torchqm.learn.callbacks.Versoins}]}",
-         r"callbacks: there is no torchqm\.learn\.callbacks\.Versoins; the nearest is torchqm\.learn\.callbacks\.Versions$"),
+         r"callbacks: there is no torchqm.*Versoins; the nearest is torchqm\.learn\.callbacks\.Versions$"),
         ("{logger: {class_path: torchqm.lern.logger.RunLogger}}",
          r"logger: there is no module torchqm\.lern; the nearest is torchqm\.learn$"),
         ("{callbacks: [{class_path: Versoins}]}",
