@@ -226,7 +226,7 @@ def test_a_pair_without_truth_is_one_line_with_the_options_that_help(tmp_path, c
     """Meshes with triangles of their own; found at the first pair, and where that has a truth, when it is loaded."""
     (tmp_path / "m").mkdir()
     save_mesh(creature(), tmp_path / "m" / "a.off")
-    save_mesh(creature(400), tmp_path / "m" / "b.off")
+    save_mesh(creature(600), tmp_path / "m" / "b.off")
     words = [*("fit", "--config", str(config(tmp_path)), "--data.root", str(tmp_path / "m"), "--data.split", "draw")]
     words += ["--data.pairs", "all", "--data.shares", "[1,0,0]", "--data.workers", workers]
     line = error_of(capsys, *words)
