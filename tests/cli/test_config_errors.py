@@ -1,6 +1,6 @@
 import pytest
 
-from torchqm.cli.config_errors import explained, nearest_key
+from torchqm.cli.config_errors import explained, nearest_key, placed
 
 KEYS = ["model.lr", "model.k", "model.weight_decay", "data.root", "data.batch_size", "trainer.max_epochs"]
 
@@ -65,3 +65,12 @@ def test_a_file_that_is_no_yaml_is_named(tmp_path):
 )
 def test_other_messages(message, line):
     assert explained(message, KEYS, []) == line
+
+
+def test_a_fault_of_a_class_has_the_group_of_its_option_and_the_file(tmp_path):
+    file = tmp_path / "c.yaml"
+    file.write_text("model: {k: 0}\n")
+    assert placed("k: 0 given", [*KEYS, "data.k"], ["--config", str(file)]) == f"{file}: model.k: 0 given"
+    assert placed("data.root: none", KEYS, ["--data.root=x"]) == "--data.root: none"
+    for text in ("start: builtin", "no such thing: k", "/data/k: empty"):
+        assert placed(text, KEYS, []) == text

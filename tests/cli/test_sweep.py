@@ -88,6 +88,9 @@ def test_what_is_wrong_in_a_sweep_is_told_in_one_line_with_its_place(tmp_path, c
         "config: a.yaml\nsetups: {half: {model.setpu: quotient}}":
             "s.yaml: setups.half: model.setpu: no such option; the nearest is --model.setup",
         "config: a.yaml\ngrid: {model.k: [ten]}": "s.yaml: grid: model.k: 'ten' given, expected int",
+        "config: a.yaml\nsetups: {fm: {model.setup: functional_map, model.supervision: orbit}}":
+            "run fm-seed=0: model.truth_form: 'spectral' given, which with supervision 'orbit' needs an even block",
+        "config: a.yaml\nsetups: {half: {model.tau: -1}}": "s.yaml: setups.half: model.tau: -1.0 given",
     }  # fmt: skip
     for text, message in cases.items():
         (tmp_path / "s.yaml").write_text(text)

@@ -11,6 +11,8 @@ import yaml
 
 from torchqm.cli.learn import evaluate
 from torchqm.cli.main import build_parser, main
+from torchqm.data import open_shapes
+from torchqm.geometry import save_mesh
 from torchqm.learn import MatchModule
 
 QUICK = Path(__file__).resolve().parents[2] / "configs" / "experiment" / "quick.yaml"
@@ -45,6 +47,11 @@ def config(folder, **more):
     path = folder / "config.yaml"
     path.write_text(yaml.safe_dump(values))
     return path
+
+
+def creature(verts=500):
+    shapes = open_shapes(f"synthetic:kinds=ellipsoid;verts={verts};triangulation=shared")
+    return shapes.mesh(shapes.names[0])
 
 
 def error_of(capsys, *argv):
@@ -107,7 +114,7 @@ def test_bad_keys_values_and_roots_are_one_line(tmp_path, capsys):
         "the nearest is save_dir"
     )
     assert error_of(capsys, "fit", "--config", given, "--model.setup", "half").startswith(
-        "setup: 'half' given, allowed"
+        "--model.setup: 'half' given, allowed"
     )
     (tmp_path / "empty").mkdir()
     assert error_of(capsys, "fit", "--config", given, "--data.root", str(tmp_path / "empty")).startswith(
@@ -192,4 +199,55 @@ def test_an_interrupt_says_how_to_go_on(tmp_path, capsys, monkeypatch):
         assert main(["fit", "--config", str(config(tmp_path))]) == 130
     finally:
         signal.signal(signal.SIGINT, before)
-    assert "the run folder RUN is kept, 'torchqm fit --resume RUN' goes on" in capsys.readouterr().err
+    run = tmp_path / "run"
+    assert f"the run folder {run} is kept, 'torchqm fit --resume {run}' goes on" in capsys.readouterr().err
+
+
+def test_what_cannot_work_is_found_before_a_folder_is_made(tmp_path, capsys):
+    given = str(config(tmp_path, model__tau=-1.0))
+    assert error_of(capsys, "fit", "--config", given).startswith(f"{given}: model.tau: -1.0 given, expected a pos")
+    given = str(config(tmp_path))
+    for words, message in (
+        (("--trainer.max_epoch", "3"), "--trainer.max_epoch: no such option; the nearest is --trainer.max_epochs"),
+        (("--model.inputs", "[wkss]"), "--model.inputs: 'wkss' given, allowed are xyz"),
+        (("--data.truth", "maybe"), "--data.truth: 'maybe' given, allowed are required"),
+        (("--data.split", "draw", "--data.shares", "[0,0,1]"), "--data.shares: [0.0, 0.0, 1.0] given, of train"),
+        (("--data.truth=none", "--model.supervision", "orbit"),
+         "--data.truth: 'none' given, but model.supervision 'orbit' needs a truth"),
+        (("--checkpoint.monitor", "val_orbit_eror"), "--checkpoint.monitor: 'val_orbit_eror' given, but such a run"),
+        (("--data.truth", "none"), "checkpoint.monitor: 'val_orbit_error' given, but such a run logs only"),
+    ):  # fmt: skip
+        assert error_of(capsys, "fit", "--config", given, *words).startswith(message)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("workers", ["0", "1"])
+def test_a_pair_without_truth_is_one_line_with_the_options_that_help(tmp_path, capsys, monkeypatch, workers):
+    """Meshes with triangles of their own; found at the first pair, and where that has a truth, when it is loaded."""
+    (tmp_path / "m").mkdir()
+    save_mesh(creature(), tmp_path / "m" / "a.off")
+    save_mesh(creature(600), tmp_path / "m" / "b.off")
+    words = [*("fit", "--config", str(config(tmp_path)), "--data.root", str(tmp_path / "m"), "--data.split", "draw")]
+    words += ["--data.pairs", "all", "--data.shares", "[1,0,0]", "--data.workers", workers]
+    line = error_of(capsys, *words)
+    assert line.startswith(f"{tmp_path / 'm'}: no truth from a to b: ")
+    assert line.endswith("--data.truth optional takes pairs without a truth, too, --data.truth none reads none at all")
+    assert not (tmp_path / "run").exists()
+    monkeypatch.setattr("torchqm.cli.lightning.first_truths", lambda *_: None)
+    late = error_of(capsys, *words)
+    assert late.startswith(f"{tmp_path / 'm'}: no truth from ")
+    assert late.endswith("--data.truth none reads none at all")
+
+
+def test_resuming_a_test_or_into_another_folder_is_refused(tmp_path, capsys):
+    assert main(["fit", "--config", str(config(tmp_path)), "--trainer.max_epochs", "1", "--pictures.every", "0"]) == 0
+    run = tmp_path / "run"
+    assert main(["test", str(run)]) == 0
+    capsys.readouterr()
+    tested = run / "test" / "version_0"
+    wanted = f"{tested}: the folder of a test, not of a training; the run that was tested is {run}"
+    assert error_of(capsys, "fit", "--resume", str(tested)) == wanted
+    assert error_of(capsys, "test", str(tested)) == wanted
+    for option in ("--trainer.logger.init_args.version", "--trainer.logger.init_args.save_dir"):
+        line = error_of(capsys, "fit", "--resume", str(run), f"{option}=other")
+        assert line.startswith(f"--resume, {option}: give one of them; a run goes on in its own folder, {run}")

@@ -127,7 +127,9 @@ def test_only_the_classes_that_are_named_are_used(tmp_path):
     [
         ({"classes": []}, "classes: none given; null stands for all"),
         ({"dtype": "half"}, "dtype: 'half' given, allowed are float32, float64"),
-        ({"batch_size": 0}, "batch_size=0"),
+        ({"batch_size": 0}, "batch_size: 0 given, expected at least 1"),
+        ({"truth": "maybe"}, "truth: 'maybe' given, allowed are required, optional, none"),
+        ({"swapped": 1.5}, "swapped: 1.5 given, expected 0 to 1"),
         ({"swapped": 0.5, "truth": "none"}, "swapped: needs a truth"),
         ({"swapped": 0.5, "keys": ("mass",)}, "swapped: needs a truth and the key 'group'"),
     ],
@@ -138,7 +140,13 @@ def test_bad_values_are_named(given, message):
 
 
 def test_a_part_without_pairs_is_an_error_when_it_is_needed():
-    with pytest.raises(ValueError, match="pairs: none left"):
-        module(shares=(0, 1, 0)).setup("fit")
+    for stage, given, message in (
+        ("fit", {"shares": (0, 0, 1)}, r"^shares: \[0, 0, 1\] given, .* leaves no shape for training"),
+        ("test", {"shares": (1, 0, 0)}, r"^shares: \[1, 0, 0\] given, .* leaves no shape for the test"),
+        ("test", {"shares": (0.9, 0, 0.1)}, r"^shares: 0\.1 of the shapes of a class in .* come to none for the test"),
+        ("fit", {"shares": (0.4, 0.6, 0)}, r"^pairs: 'within-class' has no pair among the shapes of training \(elli"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            module(**given).setup(stage)
     with pytest.raises(ValueError, match="split: 'own' given, but synthetic:"):
         module(split="own").setup("fit")

@@ -17,8 +17,13 @@ from torchqm.learn import MatchModule, NetOptions
         ({"channels": 1}, "channels: 1 given"),
         ({"tau": 0.0}, "tau: 0.0 given"),
         ({"w_align": -1.0}, "w_align: -1.0 given"),
-        ({"setup": "quotient", "supervision": "plain"}, "'plain' given for quotient"),
-        ({"setup": "functional_map", "supervision": "orbit"}, "needs an even block"),
+        ({"setup": "quotient", "supervision": "plain"}, "'plain' given for setup 'quotient'"),
+        (
+            {"setup": "functional_map", "supervision": "orbit"},
+            "setup 'functional_map' has none: use truth_form 'assign",
+        ),
+        ({"inputs": ["wkss"]}, "inputs: 'wkss' given, allowed are xyz, normals, wks, hks; the nearest is wks"),
+        ({"inputs": ["wks", "wks"]}, "inputs: .* each at most once"),
         ({"w_bij": 0, "w_orth": 0, "w_lap": 0, "w_align": 0}, "leaves no loss"),
     ],
 )

@@ -3,14 +3,16 @@
 import re
 from collections.abc import Iterator, Sequence
 from difflib import SequenceMatcher
-from importlib import import_module
-from inspect import signature
 from pathlib import Path
 from typing import Any
 
-__all__ = ["explained", "nearest_key"]
+from torchqm.cli.config_classes import allowed, arguments_of, class_fault
+
+__all__ = ["explained", "nearest_key", "placed"]
 
 _NEAR = 0.5
+_GROUPS = ("model", "data", "checkpoint", "pictures")
+_IN_CLASS = r"Problem with given class_path '[^']+':\s+Parser key \"([\w.]+)\":(.*?Given value: [^\n]*)"
 
 
 def explained(message: str, keys: Sequence[str], args: Sequence[str]) -> str:
@@ -41,22 +43,46 @@ def explained(message: str, keys: Sequence[str], args: Sequence[str]) -> str:
     inner = re.search(r"Problem with given class_path '([^']+)':\s+Option '([^']+)' is not accepted", message)
     if head and inner:
         key = f"{head[1]}.init_args.{inner[2]}"
-        return f"{_place(key, args, files)}: {inner[1]} has no such argument; {_hint(inner[2], _arguments(inner[1]))}"
+        return f"{_place(key, args, files)}: {inner[1]} has no such argument; {_hint(inner[2], arguments_of(inner[1]))}"
     if found := re.fullmatch(
         r"the following arguments are required: (?:fit\.|test\.|predict\.)?([\w.]+)", message.strip()
     ):
         return f"--{found[1]}: not given, but needed"
-    expected = list(dict.fromkeys(re.findall(r"Expected a <class '([\w.]+)'>", message)))
+    if head and (fault := class_fault(message)):
+        return f"{_place(head[1], args, files)}: {fault}"
+    key = head[1] if head else ""
+    if head and (inside := re.search(_IN_CLASS, message, re.DOTALL)):
+        key, message = f"{key}.init_args.{inside[1]}", inside[2]
+    expected = allowed(message)
     given = re.search(r"(?:Got value|Given value): (.*)", message, re.DOTALL)
     if head and expected and given:
-        names = {"NoneType": "null", "collections.abc.Iterable": "a list"}
-        words = " or ".join(names.get(word, word) for word in expected)
-        words = f"a dotted name of a class or {words}" if "dot import path" in message else words
-        return f"{_place(head[1], args, files)}: {_joined(given[1])!r} given, expected {words}"
+        return f"{_place(key, args, files)}: {_joined(given[1])!r} given, expected {expected}"
     if head and (rest := _joined(message[head.end() :])):
         dashes = "--" if message.startswith("argument --") else ""
         return f"{dashes + head[1] if dashes else _place(head[1], args, files)}: {rest}"
     return _joined(message)
+
+
+def placed(text: str, keys: Sequence[str], args: Sequence[str]) -> str:
+    """A fault that is found when what a config names is made: with the group of the option and the file that has it.
+
+    Args:
+        text: the fault; if it begins with the name of an option of model, data, checkpoint or pictures, that is meant.
+        keys: as in :func:`explained`.
+        args: likewise.
+
+    Example:
+        >>> placed("tau: -1.0 given, expected a positive number", ["model.tau"], ["--model.tau", "-1"])
+        '--model.tau: -1.0 given, expected a positive number'
+        >>> placed("shapes/cat: the folder is empty", ["model.tau"], [])
+        'shapes/cat: the folder is empty'
+    """
+    found = re.match(r"(?:(\w+)\.)?(\w+)(?=:| ')", text)
+    if found is None:
+        return text
+    groups = (found[1],) if found[1] else _GROUPS
+    key = next((f"{group}.{found[2]}" for group in groups if f"{group}.{found[2]}" in keys), None)
+    return text if key is None else f"{_place(key, args, list(_files(args)))}{text[found.end() :]}"
 
 
 def nearest_key(key: str, keys: Sequence[str]) -> str | None:
@@ -122,11 +148,6 @@ def _file(path: Path, group: str, above: tuple[Path, ...] = ()) -> Iterator[tupl
         for key, value in values.items():
             if isinstance(value, str) and value.endswith((".yaml", ".yml", ".json")):
                 yield from _file(path.parent / value, key, (*above, path.resolve()))
-
-
-def _arguments(class_path: str) -> list[str]:
-    module, _, name = class_path.rpartition(".")
-    return [key for key in signature(getattr(import_module(module), name)).parameters if key != "self"]
 
 
 def _joined(text: str) -> str:

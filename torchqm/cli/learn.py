@@ -1,5 +1,6 @@
 """Training and testing from YAML: one LightningCLI; needs the extra ``learn`` (pytorch-lightning, jsonargparse)."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,10 +10,18 @@ from torchqm.cli.console import UserError
 if TYPE_CHECKING:
     from pytorch_lightning.cli import LightningCLI
 
-__all__ = ["CONFIG_NAME", "evaluate", "fit", "learn"]
+__all__ = ["CONFIG_NAME", "Interrupted", "evaluate", "fit", "learn"]
 
 CONFIG_NAME = "config.yaml"
 """The resolved configuration in a run folder."""
+
+
+class Interrupted(SystemExit):
+    """A run was interrupted; ``folder`` is that of a training, None if there is nothing to go on with."""
+
+    def __init__(self, folder: str | None) -> None:
+        super().__init__(1)
+        self.folder = folder if folder is not None and (Path(folder) / CONFIG_NAME).is_file() else None
 
 
 def learn(args: Sequence[str], run: bool = True, resume: Path | None = None) -> "LightningCLI":
@@ -45,6 +54,12 @@ def fit(args: Sequence[str]) -> "LightningCLI":
     rest, folder = _resume(args)
     if folder is None:
         return learn(["fit", *args])
+    for word in rest:
+        if re.match(r"--trainer\.logger\.(init_args\.)?(save_dir|name|version)(=|$)", word):
+            raise UserError(
+                f"--resume, {word.partition('=')[0]}: give one of them; a run goes on in its own folder, {folder}, and "
+                f"with --ckpt_path {folder}/checkpoints/last.ckpt a run in another folder begins from its state"
+            )
     return learn(["fit", "--config", str(_config(folder)), *rest], resume=folder)
 
 
@@ -69,6 +84,16 @@ def evaluate(args: Sequence[str]) -> "LightningCLI":
 def _config(folder: Path) -> Path:
     if not (folder / CONFIG_NAME).is_file():
         raise UserError(f"{folder}: no folder of a run; {CONFIG_NAME} is missing")
+    import yaml
+
+    try:
+        found = yaml.safe_load((folder / CONFIG_NAME).read_text("utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        return folder / CONFIG_NAME  # the parser says what is wrong
+    if isinstance(found, dict) and "verbose" in found:  # an option of a test only
+        tested = Path(str(found.get("ckpt_path"))).parent.parent
+        run = f"; the run that was tested is {tested}" if (tested / CONFIG_NAME).is_file() else ""
+        raise UserError(f"{folder}: the folder of a test, not of a training{run}")
     return folder / CONFIG_NAME
 
 

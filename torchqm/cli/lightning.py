@@ -14,10 +14,13 @@ from pytorch_lightning import Callback, Trainer
 from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
-from torchqm.cli.config_errors import explained
+from torchqm.cli.agreement import check_monitor, check_truth, first_truths, without_truth
+from torchqm.cli.config_errors import explained, placed
 from torchqm.cli.console import UserError
 from torchqm.cli.inputs import shape_faults
+from torchqm.cli.learn import Interrupted
 from torchqm.cli.run_folder import Place, RunConfig, place_of_test, place_of_training, read_config
+from torchqm.data.base import TruthError
 from torchqm.data.datamodule import PairDataModule
 from torchqm.learn.callbacks import BestCheckpoint, LastEpoch, Versions
 from torchqm.learn.faults import StepError
@@ -67,7 +70,7 @@ class MatchCLI(LightningCLI):
         warnings.filterwarnings("ignore", message="You have overridden `transfer_batch_to_device`")
         # Its own checkpoints, where a run goes on in its folder.
         warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")
-        once = {"exit_on_error": False}
+        once = {"exit_on_error": False, "allow_abbrev": False}
         with shape_faults(), _stops(), ExitStack() as held:
             return cls(
                 MatchModule,
@@ -107,8 +110,7 @@ class MatchCLI(LightningCLI):
         except ArgumentError as error:
             given = [str(arg) for arg in args] if isinstance(args, list) else []
             known = getattr(self, "_subcommand_parsers", {}).get(given[0] if given else "", parser)
-            keys = sorted({*known.get_defaults().keys(), *(action.dest for action in known._actions)})
-            raise UserError(explained(error.message, keys, given)) from error
+            raise UserError(explained(error.message, _keys_of(known), given)) from error
 
     def _parse_ckpt_path(self) -> None:
         """Nothing: Lightning would put the options of a checkpoint, whatever file it is, before those of the config."""
@@ -119,7 +121,7 @@ class MatchCLI(LightningCLI):
         Raises:
             UserError: values that do not fit, or an empty data root.
         """
-        with _values():
+        with self._values():
             super().instantiate_classes()
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
@@ -128,6 +130,7 @@ class MatchCLI(LightningCLI):
         Raises:
             UserError: a checkpoint that is not there, damaged, or of another architecture.
         """
+        self._agree()
         if self.subcommand is None:
             return self._trainer(**kwargs)
         given = self.config_init[self.subcommand]
@@ -151,6 +154,33 @@ class MatchCLI(LightningCLI):
         given["ckpt_path"], given["weights_only"], self._place = place.checkpoint, True, place
         return self._trainer(**kwargs, logger=place.loggers)
 
+    def _agree(self) -> None:
+        """Find what would stop the first epoch, or the end of it."""
+        options = self.model.hparams
+        check_truth(self.datamodule.hparams["truth"], options["supervision"])
+        if self.subcommand != "test" and not self._get(self.config, "trainer.callbacks"):  # others log for themselves
+            check_monitor(self._get(self.config, "checkpoint.monitor"), options)
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        try:
+            super()._run_subcommand(subcommand)
+        except SystemExit as stop:
+            if stop.code != 1:  # Lightning's answer to an interrupt, after the callbacks have had their say
+                raise
+            folder = getattr(self.trainer.logger, "log_dir", None) if subcommand == "fit" else None
+            raise Interrupted(folder) from stop
+
+    @contextmanager
+    def _values(self) -> Iterator[None]:
+        """Values of a config that do not fit are the user's to put right; so is a package that is not there."""
+        try:
+            yield
+        except TruthError as error:
+            raise UserError(without_truth(error)) from error
+        except (ValueError, OSError, ImportError, MisconfigurationException) as error:
+            parser = self.parser if self.subcommand is None else self._parser(self.subcommand)
+            raise UserError(placed(str(error), _keys_of(parser), self._words)) from error
+
     def _trainer(self, **kwargs: Any) -> Trainer:
         try:
             return super().instantiate_trainer(**kwargs)
@@ -171,10 +201,16 @@ class MatchCLI(LightningCLI):
 
     def before_fit(self) -> None:
         """Open the shapes and read given weights, so that a fault of the config is told from one of the code."""
-        with _values():
+        with self._values():
             if self.config_init[str(self.subcommand)]["ckpt_path"] is None:
                 self.model.begin()
             self.datamodule.setup("fit")
+            first_truths(self.datamodule, "train", "validation")
+            if self.datamodule.parts["validation"] is not None and self.trainer.limit_val_batches:
+                own = self._get(self.config_init, "trainer.callbacks")
+                truth = self.datamodule.hparams["truth"] != "none"
+                if not own:
+                    check_monitor(self._get(self.config, "checkpoint.monitor"), self.model.hparams, truth)
         if self.trainer.is_global_zero:
             self._lock()
             if self._place is not None:
@@ -207,8 +243,9 @@ class MatchCLI(LightningCLI):
 
     def before_test(self) -> None:
         """Likewise."""
-        with _values():
+        with self._values():
             self.datamodule.setup("test")
+            first_truths(self.datamodule, "test")
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """What model and data must agree on is given once; checkpoints are kept by the orbit error."""
@@ -227,17 +264,12 @@ class MatchCLI(LightningCLI):
         )
 
 
+def _keys_of(parser: Any) -> list[str]:
+    return sorted({*parser.get_defaults().keys(), *(action.dest for action in parser._actions)})
+
+
 def _keys(network: str, gradients: bool) -> list[str]:
     return list(NetOptions(network=network, gradients=gradients).keys)
-
-
-@contextmanager
-def _values() -> Iterator[None]:
-    """Values of a config that do not fit are the user's to put right; so is a package that is not there."""
-    try:
-        yield
-    except (ValueError, OSError, ImportError, MisconfigurationException) as error:
-        raise UserError(str(error)) from error
 
 
 @contextmanager
@@ -245,5 +277,7 @@ def _stops() -> Iterator[None]:
     """A run that cannot go on is told in one line; every other exception is a bug and keeps its traceback."""
     try:
         yield
+    except TruthError as error:
+        raise UserError(without_truth(error)) from error
     except (StepError, MisconfigurationException) as error:
         raise UserError(str(error)) from error

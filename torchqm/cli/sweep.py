@@ -4,6 +4,7 @@ import argparse
 import csv
 import io
 import json
+import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -129,15 +130,17 @@ def _sweep(arguments: argparse.Namespace) -> tuple[list[Any], list[str]]:
         try:
             learn(run.arguments, run=False)  # a wrong key is found before the first run, not after it
         except UserError as error:
-            raise UserError(_in_file(str(error), sweep, arguments)) from error
+            raise UserError(_in_file(str(error), sweep, arguments, run.name)) from error
     with Progress() as progress:
         rows = run_sweep(sweep, arguments.out, progress, fit_and_test)
     return rows, [*(["setup"] if sweep.setups else []), *sweep.grid]
 
 
-def _in_file(text: str, sweep: Sweep, arguments: argparse.Namespace) -> str:
-    """The error with the sweep's file and the place in it in front, if the wrong option stands there."""
+def _in_file(text: str, sweep: Sweep, arguments: argparse.Namespace, name: str) -> str:
+    """The error with the sweep's file and the place in it in front, else the run in which options do not agree."""
     key = text.partition(":")[0].removeprefix("--")
+    if re.fullmatch(r"(model|data)\.\w+", key) and key == text.partition(":")[0]:  # it was not given, so is a default
+        return f"run {name}: {text}"
     if arguments.sweep is None or key in dict(arguments.set) or key in dict(arguments.grid):
         return text
     groups = {"options": sweep.options, "grid": sweep.grid}
@@ -175,7 +178,10 @@ def _quiet() -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="sweep.py", description=_DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="sweep.py",
+        description=_DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
     )
     parser.add_argument(
         "sweep", type=Path, nargs="?", metavar="SWEEP.yaml", help="config, seeds, options, setups, grid"

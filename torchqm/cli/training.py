@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from shlex import quote
 from typing import Any
 
 from torchqm.cli.console import UserError
@@ -46,6 +47,8 @@ def _run(command: Callable[[Sequence[str]], Any], args: Sequence[str]) -> int:
     except SystemExit as stop:
         if stop.code != 1:  # Lightning's answer to an interrupt, after the callbacks have had their say
             raise
-        print("torchqm: interrupted; the run folder RUN is kept, 'torchqm fit --resume RUN' goes on", file=sys.stderr)
+        folder = getattr(stop, "folder", None)
+        on = f"; the run folder {folder} is kept, 'torchqm fit --resume {quote(str(folder))}' goes on" if folder else ""
+        print(f"torchqm: interrupted{on}", file=sys.stderr)
         return 130
     return 0

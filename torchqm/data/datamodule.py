@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from torchqm.data.base import ShapeSet
 from torchqm.data.collate import collate
-from torchqm.data.dataset import PairDataset
+from torchqm.data.dataset import TRUTH_USES, PairDataset
 from torchqm.data.items import ItemOptions, make_item
 from torchqm.data.layouts import open_shapes
 from torchqm.data.pairs import choose_pairs
@@ -122,8 +122,13 @@ class PairDataModule(LightningDataModule):
         super().__init__()
         if dtype not in DTYPES:
             raise ValueError(f"dtype: {dtype!r} given, allowed are {', '.join(DTYPES)}")
-        if batch_size < 1 or workers < 0:
-            raise ValueError(f"batch_size={batch_size}, workers={workers}: at least 1 pair and 0 workers are needed")
+        if truth not in TRUTH_USES:
+            raise ValueError(f"truth: {truth!r} given, allowed are {', '.join(TRUTH_USES)}")
+        for name, value, least in (("batch_size", batch_size, 1), ("workers", workers, 0)):
+            if value < least:
+                raise ValueError(f"{name}: {value} given, expected at least {least}")
+        if not 0 <= swapped <= 1:
+            raise ValueError(f"swapped: {swapped} given, expected 0 to 1")
         if swapped and (truth == "none" or ("group" not in keys and "symmetry" not in keys)):
             raise ValueError("swapped: needs a truth and the key 'group'")
         shares, keys, classes = list(shares), list(keys), None if classes is None else list(classes)
@@ -155,13 +160,13 @@ class PairDataModule(LightningDataModule):
         given = self.hparams
         shapes = open_shapes(given["root"])
         split = self._split(shapes)
-        self.parts["train"] = self._pairs(shapes, split.train, needed=stage == "fit")
-        self.parts["validation"] = self._pairs(shapes, split.validation, needed=False)
+        self.parts["train"] = self._pairs(shapes, "train", split.train, needed=stage == "fit")
+        self.parts["validation"] = self._pairs(shapes, "validation", split.validation, needed=False)
         if given["test_root"] is None:
-            self.parts["test"] = self._pairs(shapes, split.test, needed=stage == "test")
+            self.parts["test"] = self._pairs(shapes, "test", split.test, needed=stage == "test")
         else:
             others = open_shapes(given["test_root"])
-            self.parts["test"] = self._pairs(others, tuple(others.names), needed=stage == "test")
+            self.parts["test"] = self._pairs(others, "test", tuple(others.names), needed=stage == "test")
         train = self.parts["train"]
         if given["swapped"] and isinstance(train, PairDataset):
             self.parts["train"] = SwappedTruths(train, given["swapped"], given["seed"])
@@ -195,17 +200,33 @@ class PairDataModule(LightningDataModule):
             return split
         return Split(*(tuple(v for v in split.part(p) if shapes.shape_class(v) in classes) for p in PARTS))
 
-    def _pairs(self, shapes: ShapeSet, names: tuple[str, ...], needed: bool) -> PairDataset | None:
+    def _pairs(self, shapes: ShapeSet, part: str, names: tuple[str, ...], needed: bool) -> PairDataset | None:
         given = self.hparams
         chosen = [pair for pair in choose_pairs(shapes, given["pairs"]) if set(pair) <= set(names)]
-        if not chosen and not needed:
+        if not chosen:
+            if needed:
+                raise ValueError(self._why_none(shapes, part, names))
             return None
         return PairDataset(shapes, chosen, None, self.options, given["truth"], given["keep"])
+
+    def _why_none(self, shapes: ShapeSet, part: str, names: tuple[str, ...]) -> str:
+        """Which option leaves a part without a pair."""
+        given = self.hparams
+        what = {"train": "training", "test": "the test"}.get(part, part)
+        if names:
+            return f"pairs: {given['pairs']!r} has no pair among the shapes of {what} ({', '.join(names)})"
+        if given["split"] != "draw":
+            return f"split: {given['split']!r} has no shape for {what}"
+        share = given["shares"][PARTS.index(part)]
+        if share == 0:
+            return f"shares: {given['shares']} given, of train, validation and test, which leaves no shape for {what}"
+        kind = "classes" if given["whole_classes"] else "shapes of a class"
+        return f"shares: {share} of the {kind} in {shapes.root} come to none for {what}; give it more"
 
     def _loader(self, part: str) -> DataLoader[Item]:
         pairs, given = self.parts[part], self.hparams
         if pairs is None:
-            raise ValueError(f"shares, pairs: no pair of {given['root']} is in the part {part}")
+            raise ValueError(f"shares: no pair of {given['root']} is in the part {part}")
         return DataLoader(
             pairs,
             batch_size=given["batch_size"],

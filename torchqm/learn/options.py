@@ -2,6 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
+
+from torchqm.nn.features import InputFeatures
 
 __all__ = ["NETWORKS", "SETUPS", "SUPERVISIONS", "NetOptions"]
 
@@ -76,6 +79,7 @@ class NetOptions:
         for name, allowed in words.items():
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name}: {getattr(self, name)!r} given, allowed are {', '.join(allowed)}")
+        self._check_inputs()
         for name in ("signature", "k", "width", "blocks", "odd_pairs"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: {getattr(self, name)} given, expected at least 1")
@@ -87,11 +91,24 @@ class NetOptions:
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"{name}: {getattr(self, name)} given, expected a number from 0 on")
         if self.supervision == "plain" and self.setup != "functional_map":
-            raise ValueError(f"supervision: 'plain' given for {self.setup}; it has 'orbit' and 'none'")
+            raise ValueError(f"supervision: 'plain' given for setup {self.setup!r}; it has 'orbit' and 'none'")
         if self.supervision == "orbit" and self.setup == "functional_map" and self.truth_form == "spectral":
-            raise ValueError("truth_form: 'spectral' up to symmetry needs an even block; here there is 'assignment'")
+            raise ValueError(
+                "truth_form: 'spectral' given, which with supervision 'orbit' needs an even block, so setup 'quotient' "
+                "or 'quotient+odd'; setup 'functional_map' has none: use truth_form 'assignment' with it"
+            )
         if self.supervision == "none" and not any((self.w_bij, self.w_orth, self.w_lap, self.w_align)):
             raise ValueError("supervision: 'none' with all weights 0 leaves no loss")
+
+    def _check_inputs(self) -> None:
+        known, inputs = list(InputFeatures.KEYS), list(self.inputs)
+        for name in inputs:
+            if name not in known:
+                near = get_close_matches(str(name), known, 1, 0.5)
+                hint = f"; the nearest is {near[0]}" if near else ""
+                raise ValueError(f"inputs: {name!r} given, allowed are {', '.join(known)}{hint}")
+        if not inputs or len(set(inputs)) < len(inputs):
+            raise ValueError(f"inputs: {inputs} given, expected at least one of {', '.join(known)}, each at most once")
 
     @property
     def keys(self) -> tuple[str, ...]:
