@@ -7,6 +7,7 @@ from typing import Any
 
 from torchqm.cli.config_errors import nearest_key
 from torchqm.cli.console import UserError
+from torchqm.cli.yaml_file import read_yaml
 
 __all__ = ["CONFIG_HELP", "add_config"]
 
@@ -87,13 +88,7 @@ def _options(path: Path) -> Iterator[tuple[str, Any]]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    import yaml
-
-    try:
-        values = yaml.safe_load(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        text = error.strerror if isinstance(error, OSError) and error.strerror else " ".join(str(error).split())
-        raise UserError(f"{path}: not readable as YAML ({text})") from error
+    values = read_yaml(path)
     if not isinstance(values, dict):
         raise UserError(f"{path}: expected keys and values")
     return {str(key): value for key, value in values.items()}

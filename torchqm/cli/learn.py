@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torchqm.cli.console import UserError
+from torchqm.cli.yaml_file import read_yaml
 
 if TYPE_CHECKING:
     from pytorch_lightning.cli import LightningCLI
@@ -84,11 +85,9 @@ def evaluate(args: Sequence[str]) -> "LightningCLI":
 def _config(folder: Path) -> Path:
     if not (folder / CONFIG_NAME).is_file():
         raise UserError(f"{folder}: no folder of a run; {CONFIG_NAME} is missing")
-    import yaml
-
     try:
-        found = yaml.safe_load((folder / CONFIG_NAME).read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        found = read_yaml(folder / CONFIG_NAME)
+    except UserError:
         return folder / CONFIG_NAME  # the parser says what is wrong
     if isinstance(found, dict) and "verbose" in found:  # an option of a test only
         tested = Path(str(found.get("ckpt_path"))).parent.parent

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pytorch_lightning import LightningModule, Trainer
 from pytorch_lightning.cli import SaveConfigCallback
 from pytorch_lightning.loggers import CSVLogger, Logger, TensorBoardLogger
 
 from torchqm.cli.console import UserError
 from torchqm.cli.learn import CONFIG_NAME
+from torchqm.cli.yaml_file import read_yaml
 from torchqm.learn.callbacks import LAST
 from torchqm.learn.logger import RunLogger
 from torchqm.learn.run_files import write_version
@@ -126,10 +126,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     path = folder / CONFIG_NAME
     if not path.is_file():
         raise UserError(f"{folder}: no folder of a run; {CONFIG_NAME} is missing")
-    try:
-        found = yaml.safe_load(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UserError(f"{path}: not readable as YAML ({' '.join(str(error).split())})") from error
+    found = read_yaml(path)
     if not isinstance(found, dict):
         raise UserError(f"{path}: expected keys and values")
     return found

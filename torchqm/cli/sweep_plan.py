@@ -9,6 +9,7 @@ from typing import Any
 
 from torchqm.cli.config_errors import nearest_key
 from torchqm.cli.console import UserError
+from torchqm.cli.yaml_file import read_yaml
 
 __all__ = ["Run", "Sweep", "config_digest", "read_sweep", "runs_of", "word"]
 
@@ -77,12 +78,7 @@ def read_sweep(path: Path) -> Sweep:
     Raises:
         UserError: an unknown key, or a value of the wrong kind.
     """
-    import yaml
-
-    try:
-        given = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UserError(f"{path}: not readable as YAML ({' '.join(str(error).split())})") from error
+    given = read_yaml(path)
     if not isinstance(given, dict):
         raise UserError(f"{path}: {_shown(given)} given, expected keys and values, among them 'config'")
     for key in given:

@@ -1,12 +1,13 @@
 """The options of the network and of its losses: plain values, so that a file can hold them."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from difflib import get_close_matches
+from typing import Any
 
 from torchqm.nn.features import InputFeatures
 
-__all__ = ["NETWORKS", "SETUPS", "SUPERVISIONS", "NetOptions"]
+__all__ = ["NETWORKS", "SETUPS", "SUPERVISIONS", "NetOptions", "other_architecture"]
 
 SETUPS = ("functional_map", "quotient", "quotient+odd")
 SUPERVISIONS = ("none", "orbit", "plain")
@@ -115,3 +116,33 @@ class NetOptions:
         """The keys of :class:`torchqm.data.ItemOptions` that the network reads, but for ``corr``."""
         extra = ("gradients",) if self.network == "diffusion" and self.gradients else ()
         return ("mass", "basis", "group", *extra)
+
+
+def other_architecture(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """The options that say what weights mean, where two sets of options differ in them; the others say how they are
+    trained, and what is solved with them.
+
+    Args:
+        first: options by name; those that are missing have their default.
+        second: likewise.
+
+    Returns:
+        Name, value in the first, value in the second.
+
+    Example:
+        >>> other_architecture({"width": 64, "rotations": True}, {})  # an mlp has no rotations
+        [('width', 64, 128)]
+    """
+    one, other = ({**_DEFAULTS, **given} for given in (first, second))
+    own = dict.fromkeys((*_OWN[one["network"]], *_OWN[other["network"]]))
+    both = [(name, _listed(one[name]), _listed(other[name])) for name in (*_ARCHITECTURE, *own)]
+    return [row for row in both if row[1] != row[2]]
+
+
+def _listed(value: Any) -> Any:
+    return list(value) if isinstance(value, list | tuple) else value
+
+
+_ARCHITECTURE = ("network", "inputs", "signature", "k", "channels", "odd_pairs")
+_OWN = {"none": (), "mlp": ("width", "blocks"), "diffusion": ("width", "blocks", "gradients", "rotations")}
+_DEFAULTS = {field.name: field.default for field in fields(NetOptions)}

@@ -1,15 +1,12 @@
 """Begin a training with the weights of another."""
 
 from pathlib import Path
-from typing import Any
 
 from torchqm.learn.files import load_net
 from torchqm.learn.net import MatchNet
+from torchqm.learn.options import other_architecture
 
 __all__ = ["start_from"]
-
-_ALWAYS = ("network", "inputs", "signature", "k", "channels", "odd_pairs")
-_OWN = {"none": (), "mlp": ("width", "blocks"), "diffusion": ("width", "blocks", "gradients", "rotations")}
 
 
 def start_from(net: MatchNet, path: str | Path) -> None:
@@ -38,14 +35,9 @@ def start_from(net: MatchNet, path: str | Path) -> None:
         other = load_net(path)
     except ValueError as error:
         raise ValueError(f"start: {error}") from error
-    names = (*_ALWAYS, *_OWN[net.options.network])
-    here, there = ({name: _plain(getattr(some, name)) for name in names} for some in (net.options, other.options))
-    faults = [f"{name} is {here[name]} here and {there[name]} there" for name in names if here[name] != there[name]]
+    differing = other_architecture(vars(net.options), vars(other.options))
+    faults = [f"{name} is {here} here and {there} there" for name, here, there in differing]
     if faults:
         raise ValueError(f"start: {path} holds another architecture: {', '.join(faults)}")
     # In their order: with dropout, which has no weights, the layers are numbered otherwise.
     net.load_state_dict(dict(zip(net.state_dict(), other.state_dict().values(), strict=True)))
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, list | tuple) else value

@@ -1,21 +1,17 @@
 """Checkpoints that a training goes on from, or a test reads: looked at before anything is computed or written."""
 
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
 from torchqm.learn.files import SUFFIX, differences, read_checkpoint
-from torchqm.learn.options import NetOptions
+from torchqm.learn.options import other_architecture
 
 __all__ = ["TrainingState", "check_state"]
 
-_ARCHITECTURE = ("inputs", "signature", "k", "network", "channels", "width", "blocks", "gradients", "rotations")
-"""Options that say what the weights mean; the others say how they are trained, and what is solved with them."""
-
-_DIFFUSION_ALONE = ("gradients", "rotations")
 _VERSION = "pytorch-lightning_version"
 _NEEDED = ("optimizer_states", "loops", "epoch", "global_step")
 
@@ -80,20 +76,9 @@ def check_state(
 
 
 def _compare_options(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    defaults = {f.name: f.default for f in fields(NetOptions) if f.default is not MISSING}
-    both = [(name, found.get(name, defaults[name]), wanted[name]) for name in _ARCHITECTURE]
-    diffusion = "diffusion" in (found.get("network"), wanted["network"])
-    other = [
-        f"{name} is {_plain(was)} in it and {_plain(now)} here"
-        for name, was, now in both
-        if _plain(was) != _plain(now) and (diffusion or name not in _DIFFUSION_ALONE)
-    ]
+    other = [f"{name} is {was} in it and {now} here" for name, was, now in other_architecture(found, wanted)]
     if other:
         raise ValueError(
             f"{path}: of another architecture: model.{', model.'.join(other)}; the configuration that it was trained "
             "with is in the folder of its run"
         )
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, list | tuple) else value
