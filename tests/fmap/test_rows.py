@@ -10,11 +10,28 @@ from torch.autograd import forward_ad
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from torchqm.fmap import cholesky
-from torchqm.fmap import rows as module
+from torchqm.fmap import cholesky, compiled
+from torchqm.fmap import row_operators as module
+from torchqm.fmap.compiled import kernel_for
 from torchqm.fmap.rows import UndeterminedRowsError, solve_rows
-from torchqm.fmap.threads import in_shares
 from torchqm.testing import gradcheck64
+
+
+@pytest.fixture(params=["compiled", "library"], autouse=True)
+def way(request, monkeypatch):
+    """Everything here holds for both."""
+    if request.param == "library":
+        monkeypatch.setattr(module, "kernel_for", lambda *_: None)
+    elif kernel_for(torch.device("cpu"), torch.float64) is None:
+        pytest.skip("no compiled kernel here")
+    return request.param
+
+
+def factor_size(way, n, ky, kx):
+    """Numbers in the factors of ``ky`` rows of ``n`` samples."""
+    if way == "library":
+        return n * ky * kx * kx
+    return torch.Size(kernel_for(torch.device("cpu"), torch.float64).factor_shape(n, ky, kx)).numel()
 
 
 def problem(*leading, kx=5, ky=4, c=7, seed=0):
@@ -76,6 +93,7 @@ def test_chunks_change_nothing():
 @pytest.fixture
 def threads_of_torch(monkeypatch):
     monkeypatch.setattr(module, "_WORTH_THREADS", 0)
+    monkeypatch.setattr(compiled, "_WORTH_THREADS", {"again": 0, "anew": 0})
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)
@@ -93,23 +111,6 @@ def test_threads_change_nothing_to_the_last_bit(row_chunk, threads_of_torch, mon
         found.append([fmap, *torch.autograd.grad(fmap, inputs, weight)])
         assert torch.get_num_threads() == threads
     assert all(torch.equal(one, three) for one, three in zip(*found, strict=True))
-
-
-@pytest.mark.parametrize(("row_chunk", "threads"), [(1, 3), (4, 2), (5, 3)])
-def test_all_threads_together_keep_to_the_chunk(row_chunk, threads, threads_of_torch, monkeypatch):
-    threads_of_torch(threads)
-    asked = []
-
-    def spy(run, parts, n):
-        asked.append((n, max(part.stop - part.start for part in parts)))
-        in_shares(run, parts, n)
-
-    monkeypatch.setattr(module, "in_shares", spy)
-    solve(*problem(2, kx=6, ky=9), row_chunk)
-    assert asked
-    for n, rows in asked:
-        assert n * rows <= row_chunk
-        assert n == min(threads, row_chunk)
 
 
 @pytest.mark.parametrize("threads", [1, 3])
@@ -145,6 +146,25 @@ def test_derivatives_in_forward_mode(which):
     torch.testing.assert_close(found, expected, atol=1e-7, rtol=1e-6)
 
 
+@pytest.mark.parametrize("row_chunk", [None, 1])
+def test_hessians_forward_over_reverse_and_reverse_over_forward(row_chunk):
+    given = tuple(tensor[0] for tensor in problem(1, kx=3, ky=2, c=4))
+
+    def loss(*inputs):
+        return solve(*inputs, row_chunk).pow(3).sum()
+
+    both = torch.func.jacrev(torch.func.jacrev(loss, (0, 1, 2)), (0, 1, 2))(*given)
+    for outer, inner in ((torch.func.jacfwd, torch.func.jacrev), (torch.func.jacrev, torch.func.jacfwd)):
+        torch.testing.assert_close(outer(inner(loss, (0, 1, 2)), (0, 1, 2))(*given), both, atol=1e-9, rtol=1e-9)
+
+
+def test_forward_over_forward_is_refused_since_torch_gives_wrong_numbers():
+    a, diagonal, rhs = problem(kx=3, ky=2)
+    twice = torch.func.jacfwd(torch.func.jacfwd(lambda d: solve(a, d, rhs).sum()))
+    with pytest.raises(NotImplementedError, match="take them forward over reverse"):
+        twice(diagonal)
+
+
 def test_traced_and_run_with_other_numbers():
     a, diagonal, rhs = problem(2)
     traced = torch.jit.trace(solve_rows, (a @ a.mT, diagonal, rhs), check_trace=False)
@@ -159,15 +179,6 @@ def test_what_is_below_the_diagonal_is_not_used():
     assert torch.equal(
         solve_rows(gram.triu() + 100 * torch.ones_like(gram).tril(-1), diagonal, rhs), solve_rows(gram, diagonal, rhs)
     )
-
-
-def test_a_small_problem_starts_no_threads(threads_of_torch, monkeypatch):
-    threads_of_torch(2)
-    monkeypatch.setattr(module, "_WORTH_THREADS", 9 * 6**2 + 1)
-    asked = []
-    monkeypatch.setattr(module, "in_shares", lambda run, parts, n: (asked.append(n), in_shares(run, parts, n)))
-    solve(*problem(kx=6, ky=9))
-    assert asked == [1]
 
 
 @pytest.mark.parametrize("row_chunk", [None, 2])
@@ -209,10 +220,10 @@ class Storages(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("keep", [True, False])
-def test_the_factor_is_the_only_tensor_of_its_size(keep, monkeypatch):
+def test_the_factor_is_the_only_tensor_of_its_size(keep, way, monkeypatch):
     """Neither pass makes another; without a backward pass, or in chunks, there is none."""
     a, d, r = problem(2, kx=40, ky=60, c=50)
-    whole, gram = 8 * 2 * 60 * 40 * 40, a @ a.mT
+    whole, gram = 8 * factor_size(way, 2, 60, 40), a @ a.mT
     monkeypatch.setattr("torchqm.fmap.cholesky._AT_ONCE", {"cpu": 2 * 5 * 40 * 40})
     with Storages() as seen:
         _, factor = module._solve_rows(gram, d, r, 0, keep, True)
@@ -221,26 +232,28 @@ def test_the_factor_is_the_only_tensor_of_its_size(keep, monkeypatch):
     if keep:
         with Storages() as seen:
             module._solve_rows_again(r, factor)
-        assert [size for size in seen.sizes.values() if size > whole / 10] == [whole]  # a view of the factor
+        views = [whole] if way == "library" else []  # of the factor
+        assert [size for size in seen.sizes.values() if size > whole / 10] == views
 
 
 @pytest.mark.parametrize(("row_chunk", "tracked", "kept"), [(None, True, 1), (7, True, 0), (None, False, 0)])
-def test_what_the_backward_pass_keeps(row_chunk, tracked, kept):
+def test_what_the_backward_pass_keeps(row_chunk, tracked, kept, way):
     a, d, r = problem(2, kx=10, ky=12, c=20)
     sizes = []
     with torch.autograd.graph.saved_tensors_hooks(lambda t: sizes.append(t.numel()) or t, lambda t: t):
         solve_rows((a @ a.mT).requires_grad_(tracked), d, r, row_chunk)
-    assert sizes.count(2 * 12 * 10 * 10) == kept
-    assert all(size <= 2 * 12 * 10 for size in sizes if size != 2 * 12 * 10 * 10)
+    whole = factor_size(way, 2, 12, 10)
+    assert sizes.count(whole) == kept
+    assert all(size <= 2 * 12 * 10 for size in sizes if size != whole)
 
 
-def test_the_backward_pass_makes_nothing_of_that_size():
+def test_the_backward_pass_makes_nothing_of_that_size(way):
     a, d, r = problem(2, kx=10, ky=12, c=20)
     rows = solve_rows((a @ a.mT).requires_grad_(), d.requires_grad_(), r)
     with Storages() as seen:
         rows.square().sum().backward()
     assert seen.sizes
-    assert max(seen.sizes.values()) < 8 * 2 * 12 * 10 * 10
+    assert max(seen.sizes.values()) < 8 * factor_size(way, 2, 12, 10)
 
 
 def test_undetermined_rows_are_named():

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from torchqm.fmap.lapack import has_lapack, potrf
 
-__all__ = ["factorize", "rows_at_once", "solve_checked", "solve_factored", "surely_regular"]
+__all__ = ["factorize", "noise", "rows_at_once", "solve_checked", "solve_factored", "surely_regular"]
 
 # Numbers in the systems that are factored together: on the CPU what its caches hold, on a GPU what keeps it busy.
 _AT_ONCE = {"cpu": 2**20, "gpu": 2**26}
@@ -59,10 +59,11 @@ def surely_regular(gram: Tensor, floor: Tensor) -> bool:
     root = unit.rsqrt()
     # The same triangle that is factored.
     values = torch.linalg.eigvalsh(root[..., :, None] * least * root[..., None, :], UPLO="U")
-    return bool((values[..., 0] > 4 * _noise(gram)).all())
+    return bool((values[..., 0] > 4 * noise(gram)).all())
 
 
-def _noise(systems: Tensor) -> float:
+def noise(systems: Tensor) -> float:
+    """The least eigenvalue, as a share of the largest, that systems of unit diagonal and this type can show."""
     return 8 * systems.shape[-1] ** 0.5 * torch.finfo(systems.dtype).eps
 
 
@@ -73,11 +74,10 @@ def solve_checked(upper: Tensor, rhs: Tensor, unit: Tensor) -> tuple[Tensor, Ten
     shows its smallest eigenvalue. If that is what rounding leaves of zero, the solution is noise. Pivots alone do not
     show it: they can be a million times as large.
     """
-    k = rhs.shape[-1]
-    place = torch.arange(k, device=rhs.device, dtype=rhs.dtype) + 0.5
-    signs = torch.where(place.square().cos() > 0, unit, -unit)
+    place = torch.arange(rhs.shape[-1], device=rhs.device, dtype=torch.float64) + 0.5
+    signs = torch.where(place.square().cos() > 0, unit, -unit)  # without a pattern: a part along every eigenvector
     solved = solve_factored(upper, torch.stack([rhs, signs], -2))
     once = unit * solved[..., 1, :]
     once = once / once.abs().amax(-1, keepdim=True)  # its square could overflow
     twice = unit * solve_factored(upper, (unit * once)[..., None, :])[..., 0, :]
-    return solved[..., 0, :], ~(_noise(upper) * twice.norm(dim=-1) < once.norm(dim=-1))
+    return solved[..., 0, :], ~(noise(upper) * twice.norm(dim=-1) < once.norm(dim=-1))

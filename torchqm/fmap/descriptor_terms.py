@@ -42,14 +42,18 @@ def descriptor_coefficients(
     return coeffs
 
 
-def mean_energy(products: Sequence[Tensor], masks: Sequence[Tensor | None]) -> Tensor:
-    """``(..., 1, 1)`` mean over the real functions of all blocks of the sum over their descriptors; 1 instead of 0."""
+def mean_energy(grams: Sequence[Tensor], masks: Sequence[Tensor | None]) -> Tensor:
+    """``(..., 1, 1)`` mean diagonal entry of ``s A W A^T`` over the real functions of all blocks; 1 instead of 0.
+
+    Args:
+        grams: for each block ``(..., K, K)``, zero where the functions are padding.
+        masks: for each block ``(..., K)`` true: real; None: all are.
+    """
     total: Tensor | float = 0.0
     count: Tensor | float = 0.0
-    for product, mask in zip(products, masks, strict=True):
-        energies = product.sum(-1)
-        total = total + (energies if mask is None else energies * mask).sum(-1)
-        count = count + (energies.shape[-1] if mask is None else mask.sum(-1))
+    for gram, mask in zip(grams, masks, strict=True):
+        total = total + gram.diagonal(dim1=-2, dim2=-1).sum(-1)
+        count = count + (gram.shape[-1] if mask is None else mask.sum(-1))
     mean = torch.as_tensor(total / torch.as_tensor(count).clamp_min(1))
     return torch.where(mean > 0, mean, 1.0)[..., None, None]
 

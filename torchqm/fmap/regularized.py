@@ -5,6 +5,7 @@ spectra (:mod:`torchqm.fmap.commutativity`). The energy falls apart into the row
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -81,8 +82,8 @@ def regularized_fmap(
     for name, mask in (("evals_mask_x", evals_mask_x), ("evals_mask_y", evals_mask_y)):
         if mask is not None:
             require_mask(name, mask)
-    options = (weights, sample_weights, ridge, evals_mask_x, evals_mask_y, scale, row_chunk)
-    return _minimum(coeffs_x, coeffs_y, evals_x, evals_y, lmbda, commutativity, gamma, *options)
+    terms = _terms(coeffs_x, coeffs_y, evals_x, evals_y, evals_mask_x, evals_mask_y, weights, sample_weights)
+    return _minima([terms], lmbda, commutativity, gamma, ridge, scale, row_chunk)[0]
 
 
 def regularized_blocks(
@@ -152,39 +153,35 @@ def regularized_blocks(
                 e = e * m
             spectra.append(e)
     scale = spectral_scale(*spectra) if scale is None else scale
-    energy = mean_energy(
-        [weighted_descriptors(a, weights, sample_weights, _sizes_of(a)) * a for a in coeffs_x], masks_x
-    )
-    found = []
-    for a, b, u, v, mask_x, mask_y in zip(coeffs_x, coeffs_y, evals_x, evals_y, masks_x, masks_y, strict=True):
-        options = (weights, sample_weights, ridge, mask_x, mask_y, scale, row_chunk, energy)
-        found.append(_minimum(a, b, u, v, lmbda, commutativity, gamma, *options))
-    return tuple(found)
+    terms = [
+        _terms(a, b, x, y, mask_x, mask_y, weights, sample_weights)
+        for a, b, x, y, mask_x, mask_y in zip(coeffs_x, coeffs_y, evals_x, evals_y, masks_x, masks_y, strict=True)
+    ]
+    return _minima(terms, lmbda, commutativity, gamma, ridge, scale, row_chunk)
 
 
-def _sizes_of(coeffs: Tensor) -> Sizes:
-    sizes = Sizes()
-    sizes.bind("coeffs_x", coeffs, "... Kx C")
-    return sizes
+class _Terms(NamedTuple):
+    """What one block's energy is made of; padding is zero."""
+
+    gram: Tensor
+    rhs: Tensor
+    evals_x: Tensor
+    evals_y: Tensor
+    mask_x: Tensor | None
+    mask_y: Tensor | None
+    sizes: Sizes
 
 
-def _minimum(
+def _terms(
     coeffs_x: Tensor,
     coeffs_y: Tensor,
     evals_x: Tensor,
     evals_y: Tensor,
-    lmbda: float | Tensor,
-    commutativity: str,
-    gamma: float,
+    mask_x: Tensor | None,
+    mask_y: Tensor | None,
     weights: Tensor | None,
     sample_weights: Tensor | None,
-    ridge: float,
-    evals_mask_x: Tensor | None,
-    evals_mask_y: Tensor | None,
-    scale: Tensor | None,
-    row_chunk: int | None,
-    energy: Tensor | None = None,
-) -> Tensor:
+) -> _Terms:
     sizes = Sizes()
     sizes.bind("coeffs_x", coeffs_x, "... Kx C")
     sizes.bind("coeffs_y", coeffs_y, "... Ky C")
@@ -192,29 +189,44 @@ def _minimum(
     sizes.bind("evals_y", evals_y, "... Ky")
     for name, tensor in (("coeffs_x", coeffs_x), ("coeffs_y", coeffs_y), ("evals_x", evals_x), ("evals_y", evals_y)):
         require_finite(name, tensor)
+    if mask_x is not None:
+        sizes.bind("evals_mask_x", mask_x, "... Kx")
+        coeffs_x, evals_x = coeffs_x * mask_x[..., None], evals_x * mask_x
+    if mask_y is not None:
+        sizes.bind("evals_mask_y", mask_y, "... Ky")
+        coeffs_y, evals_y = coeffs_y * mask_y[..., None], evals_y * mask_y
+    weighted = weighted_descriptors(coeffs_x, weights, sample_weights, sizes)
+    return _Terms(weighted @ coeffs_x.mT, coeffs_y @ weighted.mT, evals_x, evals_y, mask_x, mask_y, sizes)
+
+
+def _minima(
+    blocks: Sequence[_Terms],
+    lmbda: float | Tensor,
+    commutativity: str,
+    gamma: float,
+    ridge: float,
+    scale: Tensor | None,
+    row_chunk: int | None,
+) -> tuple[Tensor, ...]:
     if not 0 <= ridge < float("inf"):
         raise ValueError(f"ridge is {ridge}; only finite numbers from zero are allowed")
-    if evals_mask_x is not None:
-        sizes.bind("evals_mask_x", evals_mask_x, "... Kx")
-        coeffs_x, evals_x = coeffs_x * evals_mask_x[..., None], evals_x * evals_mask_x
-    if evals_mask_y is not None:
-        sizes.bind("evals_mask_y", evals_mask_y, "... Ky")
-        coeffs_y, evals_y = coeffs_y * evals_mask_y[..., None], evals_y * evals_mask_y
-
-    weighted = weighted_descriptors(coeffs_x, weights, sample_weights, sizes)
-    own = mean_energy([weighted * coeffs_x], [evals_mask_x])
-    if energy is None:
-        energy = own
-    else:  # of a block that holds only what rounding leaves, nothing is known
-        noise = own <= (sizes["C"] * torch.finfo(own.dtype).eps) ** 2 * energy
-        weighted, coeffs_y = torch.where(noise, 0.0, weighted), torch.where(noise, 0.0, coeffs_y)
-    gram = weighted @ coeffs_x.mT
-    diagonal = one_a_sample(lmbda, sizes) * commutativity_mask(evals_x, evals_y, commutativity, gamma, scale)
-    if ridge:
-        diagonal = diagonal + ridge * energy
-    # Systems of padding have a solution, too: 0.
-    if evals_mask_x is not None:
-        diagonal = torch.where(evals_mask_x[..., None, :], diagonal, energy.detach())
-    if evals_mask_y is not None:
-        diagonal = torch.where(evals_mask_y[..., :, None], diagonal, energy.detach())
-    return solve_rows(gram, diagonal.to(gram.dtype), coeffs_y @ weighted.mT, row_chunk)
+    grams = [block.gram if ridge else block.gram.detach() for block in blocks]
+    masks = [block.mask_x for block in blocks]
+    energy, found = mean_energy(grams, masks), []
+    for block, own, mask in zip(blocks, grams, masks, strict=True):
+        gram, rhs = block.gram, block.rhs
+        if len(blocks) > 1:  # of a block that holds only what rounding leaves, nothing is known
+            least = (block.sizes["C"] * torch.finfo(gram.dtype).eps) ** 2 * energy
+            noise = mean_energy([own], [mask]) <= least
+            gram, rhs = torch.where(noise, 0.0, gram), torch.where(noise, 0.0, rhs)
+        pulls = commutativity_mask(block.evals_x, block.evals_y, commutativity, gamma, scale)
+        diagonal = one_a_sample(lmbda, block.sizes) * pulls
+        if ridge:
+            diagonal = diagonal + ridge * energy
+        # Systems of padding have a solution, too: 0.
+        if block.mask_x is not None:
+            diagonal = torch.where(block.mask_x[..., None, :], diagonal, energy.detach())
+        if block.mask_y is not None:
+            diagonal = torch.where(block.mask_y[..., :, None], diagonal, energy.detach())
+        found.append(solve_rows(gram, diagonal.to(gram.dtype), rhs, row_chunk))
+    return tuple(found)

@@ -1,0 +1,121 @@
+"""Rows of functional maps by a kernel of our own in C (``rows.c``), where this installation has it.
+
+It works on as many systems at a time as fit a vector register: 800 systems of a hundred rows are factored, checked and
+solved in 5 ms on one core, where LAPACK's factors alone take 17 (``benchmarks/PROFILE.md``). ``pip install`` builds it
+if there is a C compiler; else :mod:`torchqm.fmap.cholesky` does the same with LAPACK.
+"""
+
+import ctypes
+import os
+from functools import cache
+from importlib.util import find_spec
+from math import prod
+
+import torch
+from torch import Tensor
+
+__all__ = ["Kernel", "kernel_for"]
+
+_NAMES = {torch.float32: ("float", ctypes.c_float), torch.float64: ("double", ctypes.c_double)}
+# Numbers in the factors of a call from which on several threads gain more than they cost, in a solve that
+# has them and in one that makes them. Measured.
+_WORTH_THREADS = {"again": 2**23, "anew": 2**19}
+# Bytes from which on large pages pay, where malloc has given memory back to the system and gets it anew.
+_LARGE = 2**22
+# OpenMP's function, where torch has loaded it; its threads are then torch's own.
+_TEAM = "GOMP_parallel"
+
+
+class Kernel:
+    """The functions of one type. Its factors are ``(n, groups, numbers)``: each sample has groups of its own.
+
+    Args:
+        library: as ctypes has loaded it.
+        dtype: float32 or float64.
+    """
+
+    def __init__(self, library: ctypes.CDLL, dtype: torch.dtype) -> None:
+        name, real = _NAMES[dtype]
+        self.lanes, self._tile = getattr(library, f"lanes_{name}")(), library.tile()
+        at, size = ctypes.c_void_p, ctypes.c_int64
+        library.large_pages.argtypes = [at, size]
+        self._large_pages = library.large_pages
+        self._solve, self._again = (getattr(library, f"{start}_{name}") for start in ("solve_rows", "solve_again"))
+        self._solve.argtypes = [at, at, at, real, size, size, size, ctypes.c_int, at, at, at]
+        self._again.argtypes = [at, at, size, size, size, ctypes.c_int, at]
+
+    def factor_shape(self, n: int, ky: int, kx: int) -> tuple[int, int, int]:
+        """Of the factors of ``ky`` rows of ``n`` samples. With symbolic sizes it is symbolic, too."""
+        blocks = (kx + self._tile - 1) // self._tile
+        groups = (ky + self.lanes - 1) // self.lanes
+        return n, groups, self._tile**2 // 2 * blocks * (blocks + 1) * self.lanes
+
+    def solve(
+        self, gram: Tensor, diagonal: Tensor, rhs: Tensor, noise: float, keep: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The rows, which of them are undetermined, and the factors (empty unless kept).
+
+        Args:
+            gram: ``(n, Kx, Kx)``; what is below its diagonal is not used.
+            diagonal: ``(n, Ky, Kx)``.
+            rhs: ``(n, Ky, Kx)``.
+            noise: below which share of its largest eigenvalue the smallest one of a system of unit diagonal counts as
+                zero. 0: only those are undetermined that have no factor.
+            keep: the factors.
+        """
+        n, ky, kx = rhs.shape
+        gram, diagonal, rhs = (_plain(tensor) for tensor in (gram, diagonal, rhs))
+        shape = self.factor_shape(n, ky, kx)
+        factor = rhs.new_empty(shape if keep else 0)
+        if factor.nbytes >= _LARGE:
+            self._large_pages(factor.data_ptr(), factor.nbytes)
+        rows, fine = torch.empty_like(rhs), torch.empty(n, ky, dtype=torch.bool, device=rhs.device)
+        given = [tensor.data_ptr() for tensor in (gram, diagonal, rhs)]
+        made = rows.data_ptr(), factor.data_ptr() if keep else None, fine.data_ptr()
+        threads = torch.get_num_threads() if prod(shape) >= _WORTH_THREADS["anew"] else 1
+        _succeed(self._solve(*given, noise, n, kx, ky, threads, *made))
+        return rows, ~fine, factor
+
+    def solve_again(self, factor: Tensor, rhs: Tensor) -> Tensor:
+        """The rows of the same systems for other right-hand sides ``(n, Ky, Kx)``."""
+        n, ky, kx = rhs.shape
+        if factor.shape != self.factor_shape(n, ky, kx):
+            raise ValueError(f"factor: {tuple(factor.shape)} given, {self.factor_shape(n, ky, kx)} expected")
+        factor, rhs = _plain(factor), _plain(rhs)
+        rows = torch.empty_like(rhs)
+        threads = torch.get_num_threads() if factor.numel() >= _WORTH_THREADS["again"] else 1
+        _succeed(self._again(factor.data_ptr(), rhs.data_ptr(), n, kx, ky, threads, rows.data_ptr()))
+        return rows
+
+
+def kernel_for(device: torch.device, dtype: torch.dtype) -> Kernel | None:
+    """The kernel for tensors like these; None where there is none, or where LAPACK is faster.
+
+    Example:
+        >>> kernel_for(torch.device("cpu"), torch.half) is None
+        True
+    """
+    return _load(dtype) if device.type == "cpu" and dtype in _NAMES else None
+
+
+@cache
+def _load(dtype: torch.dtype) -> Kernel | None:
+    found = find_spec("torchqm.fmap._rows")
+    if found is None or found.origin is None:
+        return None
+    try:
+        library = ctypes.CDLL(found.origin)
+    except OSError:  # of another system
+        return None
+    team = getattr(ctypes.CDLL(None), _TEAM, None) if os.name == "posix" else None
+    library.use_team(ctypes.cast(team, ctypes.c_void_p) if team else None)
+    return Kernel(library, dtype) if library.fast() else None
+
+
+def _plain(tensor: Tensor) -> Tensor:
+    return tensor.resolve_neg().contiguous()
+
+
+def _succeed(failed: int) -> None:
+    if failed:
+        raise MemoryError("no memory for the factor of a functional map's rows")
