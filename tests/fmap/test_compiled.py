@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from torchqm import native
 from torchqm.fmap import compiled
 from torchqm.fmap.cholesky import factorize, noise, solve_checked
 from torchqm.fmap.compiled import kernel_for
@@ -17,6 +18,11 @@ def problem(n, ky, kx, dtype=torch.float64, seed=0):
     shapes = ((n, kx, kx + 2), (n, ky, kx), (n, ky, kx))
     a, d, r = (torch.randn(shape, generator=generator, dtype=dtype) for shape in shapes)
     return a @ a.mT, d.square(), r
+
+
+def forget():
+    native.library.cache_clear()
+    compiled._load.cache_clear()
 
 
 def dense(gram, diagonal, rhs):
@@ -136,8 +142,9 @@ def test_more_threads_than_groups_change_nothing(team, monkeypatch):
         torch.get_num_threads(),
     )
     monkeypatch.setattr(compiled, "_WORTH_THREADS", {"again": 0, "anew": 0})
-    monkeypatch.setattr(compiled, "_TEAM", "GOMP_parallel" if team else "no such function")
-    compiled._load.cache_clear()
+    if not team:
+        monkeypatch.setattr(native, "_TEAM", "no such function")
+    forget()
     try:
         torch.set_num_threads(7)
         kernel = kernel_for(CPU, torch.float32)
@@ -147,7 +154,7 @@ def test_more_threads_than_groups_change_nothing(team, monkeypatch):
     finally:
         torch.set_num_threads(before)
         monkeypatch.undo()
-        compiled._load.cache_clear()
+        forget()
         kernel_for(CPU, torch.float32)
 
 
@@ -157,21 +164,6 @@ def test_a_factor_of_other_sizes_is_refused():
     factor = kernel.solve(gram, diagonal, rhs, 0.0, keep=True)[2]
     with pytest.raises(ValueError, match=r"factor: \(2, 3, 960\) given, \(2, 3, 640\) expected"):
         kernel.solve_again(factor, rhs[..., :16])
-
-
-@pytest.mark.parametrize("file", [None, "text"], ids=["not built", "of another system"])
-def test_where_it_is_missing_there_is_none(file, tmp_path, monkeypatch):
-    spec = None
-    if file:
-        path = tmp_path / "_rows.so"
-        path.write_text("not a library")
-        spec = type("Spec", (), {"origin": str(path)})
-    monkeypatch.setattr(compiled, "find_spec", lambda name: spec)
-    compiled._load.cache_clear()
-    try:
-        assert kernel_for(CPU, torch.float32) is None
-    finally:
-        compiled._load.cache_clear()
 
 
 @pytest.mark.parametrize("what", [(torch.device("meta"), torch.float32), (CPU, torch.half)])

@@ -6,13 +6,13 @@ if there is a C compiler; else :mod:`torchqm.fmap.cholesky` does the same with L
 """
 
 import ctypes
-import os
 from functools import cache
-from importlib.util import find_spec
 from math import prod
 
 import torch
 from torch import Tensor
+
+from torchqm.native import library
 
 __all__ = ["Kernel", "kernel_for"]
 
@@ -22,25 +22,22 @@ _NAMES = {torch.float32: ("float", ctypes.c_float), torch.float64: ("double", ct
 _WORTH_THREADS = {"again": 2**23, "anew": 2**19}
 # Bytes from which on large pages pay, where malloc has given memory back to the system and gets it anew.
 _LARGE = 2**22
-# OpenMP's function, where torch has loaded it; its threads are then torch's own.
-_TEAM = "GOMP_parallel"
 
 
 class Kernel:
     """The functions of one type. Its factors are ``(n, groups, numbers)``: each sample has groups of its own.
 
     Args:
-        library: as ctypes has loaded it.
+        built: the library, as ctypes has loaded it.
         dtype: float32 or float64.
     """
 
-    def __init__(self, library: ctypes.CDLL, dtype: torch.dtype) -> None:
+    def __init__(self, built: ctypes.CDLL, dtype: torch.dtype) -> None:
         name, real = _NAMES[dtype]
-        self.lanes, self._tile = getattr(library, f"lanes_{name}")(), library.tile()
+        self.lanes, self._tile = getattr(built, f"lanes_{name}")(), built.tile()
         at, size = ctypes.c_void_p, ctypes.c_int64
-        library.large_pages.argtypes = [at, size]
-        self._large_pages = library.large_pages
-        self._solve, self._again = (getattr(library, f"{start}_{name}") for start in ("solve_rows", "solve_again"))
+        self._large_pages = built.large_pages
+        self._solve, self._again = (getattr(built, f"{start}_{name}") for start in ("solve_rows", "solve_again"))
         self._solve.argtypes = [at, at, at, real, size, size, size, ctypes.c_int, at, at, at]
         self._again.argtypes = [at, at, size, size, size, ctypes.c_int, at]
 
@@ -100,16 +97,8 @@ def kernel_for(device: torch.device, dtype: torch.dtype) -> Kernel | None:
 
 @cache
 def _load(dtype: torch.dtype) -> Kernel | None:
-    found = find_spec("torchqm.fmap._rows")
-    if found is None or found.origin is None:
-        return None
-    try:
-        library = ctypes.CDLL(found.origin)
-    except OSError:  # of another system
-        return None
-    team = getattr(ctypes.CDLL(None), _TEAM, None) if os.name == "posix" else None
-    library.use_team(ctypes.cast(team, ctypes.c_void_p) if team else None)
-    return Kernel(library, dtype) if library.fast() else None
+    built = library("torchqm.fmap._rows")
+    return None if built is None else Kernel(built, dtype)
 
 
 def _plain(tensor: Tensor) -> Tensor:

@@ -163,7 +163,7 @@ CLONES static void NAME(solve_groups)(void *given) {
     const int64_t size = NAME(start)(padded / TILE);
     VEC *space = malloc(sizeof(VEC) * (3 * padded + (t->factors ? 0 : size)));
     if (!space) t->failed = 1;
-    for (int64_t g; space && (g = __atomic_fetch_add(&t->next, 1, __ATOMIC_RELAXED)) < t->n * groups;) {
+    for (int64_t g; space && (g = take(&t->next)) < t->n * groups;) {
         const int64_t sample = g / groups, row = g % groups * LANES;
         const REAL *gram = t->gram + sample * k * k;
         VEC *diagonals = space, *x = diagonals + padded, *unit = x + padded, good;
@@ -184,7 +184,7 @@ CLONES static void NAME(solve_groups_again)(void *given) {
     const int64_t k = t->k, ky = t->ky, padded = (k + TILE - 1) / TILE * TILE, groups = (ky + LANES - 1) / LANES;
     VEC *x = malloc(sizeof(VEC) * padded);
     if (!x) t->failed = 1;
-    for (int64_t g; x && (g = __atomic_fetch_add(&t->next, 1, __ATOMIC_RELAXED)) < t->n * groups;) {
+    for (int64_t g; x && (g = take(&t->next)) < t->n * groups;) {
         const int64_t sample = g / groups, row = g % groups * LANES;
         NAME(gather)(t->rhs + sample * ky * k, k, ky, row, x);
         NAME(solve)((const VEC *)t->factors + g * NAME(start)(padded / TILE), k, x);

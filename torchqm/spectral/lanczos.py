@@ -1,6 +1,5 @@
 """Lowest eigenpairs of a sparse matrix by block Lanczos on a filtered inverse, with many right-hand sides at a time."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +7,8 @@ import scipy
 import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
+
+from torchqm.spectral.sparse_solve import FactorError, factorize
 
 __all__ = ["BLOCK", "LanczosError", "LanczosPairs", "lowest_eigenpairs", "residual_scale"]
 
@@ -21,13 +22,9 @@ _SHIFT, _CUT = (
     0.15,
     1.5,
 )  # of the last eigenvalue wanted: below zero, and where the filter begins to let functions through
-_COLUMNS = {"cpu": 8, "cuda": 64}
-# Right-hand sides of one call: 0.5 ms each at 28k vertices on a CPU, with 200 in one call 0.9 ms; a GPU takes 128.
 _CHECK_FROM, _CHECK_EVERY = 1.2, 2
 _GUESSES, _WIDER = 4, 2  # filters that are tried, and how often the blocks are doubled
 _ZERO = 1e-9  # of the last eigenvalue wanted: the eigenvalue of a constant function is below it
-
-Operation = Callable[[Tensor], Tensor]
 
 
 class LanczosError(RuntimeError):
@@ -157,7 +154,10 @@ def _excess(matrix: "scipy.sparse.csc_array", pairs: LanczosPairs, tol: float) -
 
 
 class _Run:
-    """One Lanczos run with one filter; rows of ``vectors`` are orthonormal. Long vectors are on the device."""
+    """One Lanczos run with one filter; rows of ``vectors`` are orthonormal.
+
+    Long vectors are on the device, in the order of the factor.
+    """
 
     def __init__(
         self, matrix: "scipy.sparse.csc_array", k: int, tol: float, guess: float, block: int, device: torch.device
@@ -166,7 +166,10 @@ class _Run:
         self.device = device
         self.matrix, self.k, self.tol, self.guess, self.block = matrix, k, tol, guess, block
         self.shift = _SHIFT * guess
-        self.solve = _solver(matrix, self.shift, device)
+        try:
+            self.factor = factorize(matrix, self.shift, device)
+        except FactorError as error:
+            raise LanczosError(f"block Lanczos: {error}") from error
         self.centre = 0.5 / (_CUT * guess + self.shift)
         self.limit = min(4 * k + 30 * block, n - block)
         if self.limit < k + block:
@@ -181,12 +184,12 @@ class _Run:
 
     def iterate(self) -> bool:
         """Add blocks until the pairs have converged; False if there is no room for more."""
-        new, _, _ = self._orthonormal(self._filtered(self._random_rows(self.block)))
+        new, _, _ = self._orthonormal(self.factor.filtered(self._random_rows(self.block), self.centre, 2))
         steps = 0
         while True:
             begin, self.size = self.size, self.size + self.block
             self.vectors[begin : self.size] = new
-            new, along, rest = self._orthonormal(self._filtered(new))
+            new, along, rest = self._orthonormal(self.factor.filtered(new, self.centre, 2))
             self.projected[: self.size, begin : self.size] = along
             self.projected[begin : self.size, : self.size] = along.T
             steps += 1
@@ -212,10 +215,10 @@ class _Run:
         """Ritz vectors, one more solve of each, and the matrix diagonalised on what comes out."""
         start = self._there(self.ritz.T.copy()) @ self.vectors[: self.size]
         self.vectors = start  # the long list is not needed any more
-        solved = self.solve(start)
+        solved = self.factor.filtered(start)
         gram, form = _here(solved @ solved.T), _here(solved @ start.T)  # (A + s) solved = start
         shifted, turn = scipy.linalg.eigh((form + form.T) / 2, (gram + gram.T) / 2)
-        evecs = (self._there(turn.T.copy()) @ solved).cpu()
+        evecs = self._in_order((self._there(turn.T.copy()) @ solved).cpu())
         evals = shifted - self.shift
         applied = (self.matrix @ evecs.numpy().T).T - evals[:, None] * evecs.numpy()
         scale = residual_scale(evals, self.guess)
@@ -242,13 +245,16 @@ class _Run:
         bounds = np.linalg.norm(rest, axis=0) * shifted**2 / (gap * scale)
         return np.where(open_, bounds, np.inf)
 
-    def _filtered(self, rows: Tensor) -> Tensor:
-        for _ in range(2):
-            rows = self.solve(rows).sub_(rows, alpha=self.centre)
-        return rows
-
     def _random_rows(self, count: int) -> Tensor:
         return self._there(self.random.standard_normal((count, self.matrix.shape[0])))
+
+    def _in_order(self, rows: Tensor) -> Tensor:
+        """Columns as in the matrix."""
+        if self.factor.order is None:
+            return rows
+        sorted_ = torch.empty_like(rows)
+        sorted_[:, torch.from_numpy(self.factor.order)] = rows
+        return sorted_
 
     def _there(self, values: np.ndarray) -> Tensor:
         return torch.from_numpy(values).to(self.device)
@@ -294,33 +300,6 @@ class _Run:
 
 def _here(values: Tensor) -> np.ndarray:
     return values.cpu().numpy()
-
-
-def _solver(matrix: "scipy.sparse.csc_array", shift: float, device: torch.device) -> Operation:
-    """Solves with ``A + shift`` for each row, a few rows at a time."""
-    import cholespy
-
-    shifted = scipy.sparse.csc_array(matrix + shift * scipy.sparse.eye_array(matrix.shape[0], format="csc"))
-    shifted.sort_indices()
-    entries = (shifted.indptr.astype(np.int32), shifted.indices.astype(np.int32), shifted.data)
-    try:
-        # It factors, and solves, where these are.
-        there = [torch.from_numpy(values).to(device) for values in entries]
-        factor = cholespy.CholeskySolverD(matrix.shape[0], *there, cholespy.MatrixType.CSC)
-    except (RuntimeError, ValueError) as error:
-        raise LanczosError(f"no Cholesky factor: {error}") from error
-    columns = _COLUMNS[device.type]
-
-    def solve(rows: Tensor) -> Tensor:
-        result = torch.empty_like(rows)
-        for begin in range(0, rows.shape[0], columns):
-            given = rows[begin : begin + columns].T.contiguous()
-            found = torch.empty_like(given)
-            factor.solve(given, found)
-            result[begin : begin + columns] = found.T
-        return result
-
-    return solve
 
 
 def _widest_cluster(evals: np.ndarray, rtol: float, guess: float) -> int:
