@@ -8,6 +8,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
+from torchqm.spectral.projections import for_products, project, subtract_
 from torchqm.spectral.sparse_solve import FactorError, factorize
 
 __all__ = ["BLOCK", "LanczosError", "LanczosPairs", "lowest_eigenpairs", "residual_scale"]
@@ -174,9 +175,8 @@ class _Run:
         self.limit = min(4 * k + 30 * block, n - block)
         if self.limit < k + block:
             raise LanczosError(f"block Lanczos: {n} rows are too few for {k} pairs in blocks of {block}")
-        self.vectors = torch.empty(
-            self.limit, n, dtype=torch.float64, device=device
-        )  # memory is taken as it is written
+        # Memory is taken as it is written.
+        self.vectors = for_products(torch.empty(self.limit, n, dtype=torch.float64, device=device))
         self.projected = np.zeros((self.limit, self.limit))
         self.random = np.random.default_rng(0)
         self.size, self.done = 0, 0
@@ -268,8 +268,8 @@ class _Run:
         along, rest = np.zeros((self.size, rows.shape[0])), np.eye(rows.shape[0])
         for begin in (max(self.size - 2 * self.block, 0), 0):
             if self.size:
-                part = self.vectors[begin : self.size] @ rows.T
-                rows = rows.addmm_(part.T, self.vectors[begin : self.size], alpha=-1)
+                part = project(self.vectors[begin : self.size], rows)
+                subtract_(rows, self.vectors[begin : self.size], part)
                 along[begin:] += _here(part) @ rest
             rows, turn = self._whitened(rows)
             rest = turn @ rest
