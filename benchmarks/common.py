@@ -18,6 +18,7 @@ import torch
 
 from torchqm.geometry import Mesh
 from torchqm.geometry.files import write_whole
+from torchqm.native import available
 from torchqm.spectral import SpectralBasis, mesh_basis
 from torchqm.version import __version__
 
@@ -43,6 +44,7 @@ def provenance() -> dict[str, Any]:
             "cpus": os.cpu_count(),
             "torch_threads": torch.get_num_threads(),
             "memory_gib": _memory_gib(),
+            "compiled": available(),
         },
     }
 

@@ -53,7 +53,7 @@ def one(part: str, n_verts: int) -> dict[str, float]:
     return row
 
 
-def measure(sizes: list[int], largest_match: int = 260000) -> None:
+def measure(sizes: list[int], largest_match: int = 1100000) -> None:
     """Each size in a process of its own, with the fitted exponents and a plot."""
     rows: dict[str, list[dict[str, float]]] = {part: [] for part in PARTS}
     for n_verts in sizes:

@@ -16,7 +16,7 @@ def test_version(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["--version"])
     assert stop.value.code == 0
-    assert capsys.readouterr().out == f"torchqm {__version__}\n"
+    assert capsys.readouterr().out.splitlines()[0] == f"torchqm {__version__}"
 
 
 @pytest.mark.parametrize("command", [[], ["demo"], ["match"], ["symmetry"], ["prepare"]])

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from torchqm.cli import benchmark, data, demo, export, match, predict, prepare, symmetry, training
 from torchqm.cli.console import UserError
 from torchqm.cli.threads import set_threads
+from torchqm.native import available
 from torchqm.version import __version__
 
 __all__ = ["build_parser", "main"]
@@ -38,6 +39,16 @@ data set could not be used (the others were), 2 wrong input (one line on stderr 
 file and what is wrong with it; nothing is written), 130 interrupted."""
 
 
+class _Version(argparse.Action):
+    def __init__(self, option_strings: Sequence[str], dest: str, help: str) -> None:
+        super().__init__(option_strings, argparse.SUPPRESS, nargs=0, default=argparse.SUPPRESS, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        parts = ", ".join(available()) or "none; functional maps and eigenpairs take longer"
+        print(f"torchqm {__version__}\ncompiled parts: {parts}")
+        parser.exit()
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands; importing and building it takes no torch."""
     parser = argparse.ArgumentParser(
@@ -47,7 +58,7 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("--version", action="version", version=f"torchqm {__version__}")
+    parser.add_argument("--version", action=_Version, help="what is installed, and exit")
     commands = parser.add_subparsers(metavar="COMMAND", dest="command", required=True)
     for module in (demo, match, symmetry, data, prepare, benchmark, training, predict, export):
         module.add_parser(commands)

@@ -97,7 +97,7 @@ def kernel_for(device: torch.device, dtype: torch.dtype) -> Kernel | None:
 
 @cache
 def _load(dtype: torch.dtype) -> Kernel | None:
-    built = library("torchqm.fmap._rows")
+    built = library("fmap/_rows")
     return None if built is None else Kernel(built, dtype)
 
 

@@ -67,7 +67,7 @@ def _ours(vectors: Tensor, rows: Tensor) -> ctypes.CDLL | None:
 
 @cache
 def _built() -> ctypes.CDLL | None:
-    built = library("torchqm.spectral._projections")
+    built = library("spectral/_projections")
     if built is not None:
         at, size, integer = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int
         built.parts.argtypes, built.parts.restype = [size], size

@@ -44,7 +44,7 @@ def factorize(matrix: "scipy.sparse.csc_array", shift: float, device: torch.devi
     """
     shifted = scipy.sparse.csc_array(matrix + shift * scipy.sparse.eye_array(matrix.shape[0], format="csc"))
     shifted.sort_indices()
-    built = library("torchqm.spectral._ldl") if device.type == "cpu" else None
+    built = library("spectral/_ldl") if device.type == "cpu" else None
     return _Cholespy(shifted, device) if built is None else _Ours(shifted, built)
 
 
