@@ -3,8 +3,8 @@
 import sys
 import warnings
 from argparse import ArgumentError
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +12,16 @@ import yaml
 from filelock import FileLock, Timeout
 from pytorch_lightning import Callback, Trainer
 from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
-from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
-from torchqm.cli.agreement import check_monitor, check_truth, first_truths, without_truth
-from torchqm.cli.config_errors import explained, placed
+from torchqm.cli.agreement import check_monitor, check_truth, first_truths
+from torchqm.cli.config_errors import explained
+from torchqm.cli.config_faults import stops, value_faults
 from torchqm.cli.console import UserError
 from torchqm.cli.inputs import shape_faults
 from torchqm.cli.learn import Interrupted
 from torchqm.cli.run_folder import Place, RunConfig, place_of_test, place_of_training, read_config
-from torchqm.data.base import TruthError
 from torchqm.data.datamodule import PairDataModule
 from torchqm.learn.callbacks import BestCheckpoint, LastEpoch, Versions
-from torchqm.learn.faults import StepError
 from torchqm.learn.logger import RunLogger
 from torchqm.learn.module import MatchModule
 from torchqm.learn.options import NetOptions
@@ -71,7 +69,7 @@ class MatchCLI(LightningCLI):
         # Its own checkpoints, where a run goes on in its folder.
         warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")
         once = {"exit_on_error": False, "allow_abbrev": False}
-        with shape_faults(), _stops(), ExitStack() as held:
+        with shape_faults(), stops(args), ExitStack() as held:
             return cls(
                 MatchModule,
                 PairDataModule,
@@ -170,21 +168,23 @@ class MatchCLI(LightningCLI):
             folder = getattr(self.trainer.logger, "log_dir", None) if subcommand == "fit" else None
             raise Interrupted(folder) from stop
 
-    @contextmanager
-    def _values(self) -> Iterator[None]:
-        """Values of a config that do not fit are the user's to put right; so is a package that is not there."""
-        try:
-            yield
-        except TruthError as error:
-            raise UserError(without_truth(error)) from error
-        except (ValueError, OSError, ImportError, MisconfigurationException) as error:
-            parser = self.parser if self.subcommand is None else self._parser(self.subcommand)
-            raise UserError(placed(str(error), _keys_of(parser), self._words)) from error
+    def _values(self, option: str = "") -> AbstractContextManager[None]:
+        """Values of a config that do not fit are told with their option, else with this one."""
+
+        def keys() -> list[str]:
+            return _keys_of(self.parser if self.subcommand is None else self._parser(self.subcommand))
+
+        return value_faults(self._words, keys, option)
+
+    def _set_seed(self) -> None:
+        with self._values("seed_everything"):
+            super()._set_seed()
 
     def _trainer(self, **kwargs: Any) -> Trainer:
         try:
-            return super().instantiate_trainer(**kwargs)
-        except RuntimeError as error:
+            with self._values("trainer"):
+                return super().instantiate_trainer(**kwargs)
+        except UserError as error:
             if "stateful callback" not in str(error):
                 raise
             name = str(error).split("`")[1]
@@ -227,6 +227,8 @@ class MatchCLI(LightningCLI):
             self._held.enter_context(FileLock(folder / ".lock", timeout=0))
         except Timeout as error:
             raise UserError(f"{folder}: another training is writing there") from error
+        except OSError as error:
+            raise UserError(f"{folder}: the run folder cannot be made ({error.strerror or error})") from error
 
     def _tell(self, place: Place, state: TrainingState | None) -> None:
         if place.folder is None:
@@ -270,14 +272,3 @@ def _keys_of(parser: Any) -> list[str]:
 
 def _keys(network: str, gradients: bool) -> list[str]:
     return list(NetOptions(network=network, gradients=gradients).keys)
-
-
-@contextmanager
-def _stops() -> Iterator[None]:
-    """A run that cannot go on is told in one line; every other exception is a bug and keeps its traceback."""
-    try:
-        yield
-    except TruthError as error:
-        raise UserError(without_truth(error)) from error
-    except (StepError, MisconfigurationException) as error:
-        raise UserError(str(error)) from error
