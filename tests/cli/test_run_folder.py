@@ -20,6 +20,8 @@ from torchqm.cli.run_folder import place_of_test, place_of_training, read_config
 from torchqm.learn.callbacks import LastEpoch
 from torchqm.learn.logger import RunLogger
 
+pytestmark = pytest.mark.usefixtures("plain_curves")
+
 ROOT = "synthetic:kinds=ellipsoid;poses=6;verts=500;triangulation=shared"
 EPOCHS = 4
 

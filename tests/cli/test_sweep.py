@@ -12,6 +12,8 @@ from torchqm.cli.console import Progress, UserError
 from torchqm.cli.sweep import main, run_sweep, write_tables
 from torchqm.cli.sweep_plan import Sweep
 
+pytestmark = pytest.mark.usefixtures("plain_curves")
+
 SCRIPT = Path(__file__).resolve().parents[2] / "train" / "sweep.py"
 
 

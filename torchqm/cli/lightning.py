@@ -84,7 +84,7 @@ class MatchCLI(LightningCLI):
                 parser_kwargs={
                     "prog": "torchqm",
                     **once,
-                    **{name: {"description": text, **once} for name, text in _ABOUT.items()},
+                    **{name: {"description": text, **once} for name, text in _about(args).items()},
                 },
                 trainer_defaults={
                     "callbacks": own_callbacks(),
@@ -92,10 +92,9 @@ class MatchCLI(LightningCLI):
                 },
             )
 
-    @staticmethod
-    def subcommands() -> dict[str, set[str]]:
+    def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]  # Lightning asks the object, too
         """Those that there is a module and data for."""
-        return {name: found for name, found in LightningCLI.subcommands().items() if name in _ABOUT}
+        return {name: found for name, found in LightningCLI.subcommands().items() if name in _about(self._words)}
 
     def parse_arguments(self, parser: LightningArgumentParser, args: ArgsType) -> None:
         """Parse.
@@ -264,6 +263,11 @@ class MatchCLI(LightningCLI):
                 "checkpoint.mode": "min",
             }
         )
+
+
+def _about(words: Sequence[str]) -> dict[str, str]:
+    """What each subcommand does; the one that is called alone, since making the parser of one takes a while."""
+    return {name: text for name, text in _ABOUT.items() if name in words[:1]} or _ABOUT
 
 
 def _keys_of(parser: Any) -> list[str]:
