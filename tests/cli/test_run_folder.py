@@ -242,8 +242,9 @@ def test_another_config_or_an_earlier_state_begins_a_run_of_its_own(folder, watc
     run = Path("runs", "version_0")
     before = contents(run)
     words = ["--config", str(run / "config.yaml"), "--trainer.logger.init_args.save_dir", "runs"]
-    for file, more in (("last.ckpt", ["--data.batch_size", "2"]), ("best-epoch=0.ckpt", ["--trainer.max_epochs", "2"])):
-        went = fit([*words, "--ckpt_path", str(run / "checkpoints" / file), *more, "--trainer.max_epochs", "5"])
+    last = ["--data.batch_size", "2", "--trainer.max_epochs", "5"]
+    for file, more in (("last.ckpt", last), ("best-epoch=0.ckpt", ["--trainer.max_epochs", "2"])):
+        went = fit([*words, "--ckpt_path", str(run / "checkpoints" / file), *more])
         new = Path(went.trainer.log_dir)
         assert f"{file}: a run of its own begins from this state" in capsys.readouterr().err
         assert [Path(path).parent for path in went.config_init["fit"]["checkpoint"].best_k_models] == [
