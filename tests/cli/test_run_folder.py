@@ -16,7 +16,7 @@ from pytorch_lightning.loggers import CSVLogger, TensorBoardLogger
 
 from torchqm.cli.console import UserError
 from torchqm.cli.learn import evaluate, fit
-from torchqm.cli.run_folder import place_of_test, place_of_training, read_config
+from torchqm.cli.run_folder import hold, place_of_test, place_of_training, read_config
 from torchqm.learn.callbacks import LastEpoch
 from torchqm.learn.logger import RunLogger
 
@@ -193,6 +193,17 @@ def test_two_trainings_do_not_share_a_folder(folder, watch, tmp_path):
     with FileLock(run / ".lock"), pytest.raises(UserError, match="run: another training is writing there"):
         fit(["--resume", str(run), "--trainer.max_epochs", str(EPOCHS + 1)])
     assert contents(run) == before
+
+
+def test_a_folder_is_held_by_one_alone_and_made_if_it_can_be(tmp_path):
+    run = tmp_path / "runs" / "new"
+    with hold(run), pytest.raises(UserError, match="new: another training is writing there"):
+        hold(run)
+    with hold(run):  # free again
+        pass
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match=r"file.run: the run folder cannot be made \(Not a directory\)"):
+        hold(tmp_path / "file" / "run")
 
 
 def contents(run):

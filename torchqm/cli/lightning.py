@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from filelock import FileLock, Timeout
 from pytorch_lightning import Callback, Trainer
 from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
 
@@ -19,7 +18,7 @@ from torchqm.cli.config_faults import stops, value_faults
 from torchqm.cli.console import UserError
 from torchqm.cli.inputs import shape_faults
 from torchqm.cli.learn import Interrupted
-from torchqm.cli.run_folder import Place, RunConfig, place_of_test, place_of_training, read_config
+from torchqm.cli.run_folder import Place, RunConfig, hold, place_of_test, place_of_training, read_config
 from torchqm.data.datamodule import PairDataModule
 from torchqm.learn.callbacks import BestCheckpoint, LastEpoch, Versions
 from torchqm.learn.logger import RunLogger
@@ -210,36 +209,12 @@ class MatchCLI(LightningCLI):
                 truth = self.datamodule.hparams["truth"] != "none"
                 if not own:
                     check_monitor(self._get(self.config, "checkpoint.monitor"), self.model.hparams, truth)
-        if self.trainer.is_global_zero:
-            self._lock()
-            if self._place is not None:
-                self._tell(self._place, self._state)
-
-    def _lock(self) -> None:
-        """Hold the folder until the end: two runs in it would write into each other's metrics and checkpoints."""
-        logger = next((logger for logger in self.trainer.loggers if isinstance(logger, RunLogger)), None)
-        if logger is None:
+        if not self.trainer.is_global_zero:
             return
-        folder = Path(logger.log_dir)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._held.enter_context(FileLock(folder / ".lock", timeout=0))
-        except Timeout as error:
-            raise UserError(f"{folder}: another training is writing there") from error
-        except OSError as error:
-            raise UserError(f"{folder}: the run folder cannot be made ({error.strerror or error})") from error
-
-    def _tell(self, place: Place, state: TrainingState | None) -> None:
-        if place.folder is None:
-            text = "" if state is None else f"{state.path}: a run of its own begins from this state"
-        elif state is None or not place.goes_on:
-            text = f"{place.folder}: no epoch was finished, so that it begins anew"
-        else:
-            most = self.trainer.max_epochs
-            done = most is not None and 0 <= most <= state.epochs
-            more = "; that is all it was to do, more is done with --trainer.max_epochs N" if done else ""
-            text = f"{place.folder}: goes on after {state.epochs} epochs, {state.steps} steps{more}"
-        if text:
+        logger = next((logger for logger in self.trainer.loggers if isinstance(logger, RunLogger)), None)
+        if logger is not None:
+            self._held.enter_context(hold(Path(logger.log_dir)))
+        if self._place is not None and (text := self._place.news(self._state, self.trainer.max_epochs)):
             print(f"torchqm: {text}", file=sys.stderr)
 
     def before_test(self) -> None:
