@@ -5,6 +5,8 @@ from torchqm.cli.learn import fit
 from torchqm.data.base import TruthError, TruthFileError
 from torchqm.learn import MatchModule
 
+pytestmark = pytest.mark.usefixtures("plain_curves")
+
 ROOT = "synthetic:kinds=ellipsoid;poses=4;verts=500;triangulation=shared"
 OPTIONS = dict(MatchModule(k=8).hparams)
 

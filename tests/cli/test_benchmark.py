@@ -12,6 +12,7 @@ import pytest
 from references.matchers import Scripted
 
 from torchqm.cli import benchmark as command
+from torchqm.cli.benchmark_help import DEFAULT_METHODS
 from torchqm.cli.main import main
 from torchqm.cli.processes import Failure
 from torchqm.evaluate import report
@@ -334,4 +335,4 @@ def test_the_help_names_all_methods(capsys):
     assert stop.value.code == 0
     text = capsys.readouterr().out
     assert all(f"  {name} " in text for name in MATCHERS)
-    assert set(command.DEFAULT_METHODS.split(",")) <= set(MATCHERS)
+    assert set(DEFAULT_METHODS.split(",")) <= set(MATCHERS)

@@ -1,6 +1,9 @@
 import io
+import warnings
 
-from torchqm.cli.console import Progress
+import pytest
+
+from torchqm.cli.console import Progress, warnings_as_lines
 
 
 class Clock:
@@ -53,3 +56,13 @@ def test_on_a_terminal_one_line_is_rewritten_and_wiped_at_the_end():
     assert "[ 50 %] eigenpairs (0 s)" in written
     assert "[ 75 %], about 1 s left" in written
     assert written.endswith("\r\033[K")
+
+
+def test_a_warning_for_the_user_is_a_line_and_the_others_stay_what_they_are(capsys):
+    with warnings.catch_warnings(record=True) as caught, warnings_as_lines():
+        warnings.warn("taken for its name", stacklevel=1)
+        warnings.warn("old", DeprecationWarning, stacklevel=1)
+    assert [str(one.message) for one in caught] == ["old"]
+    assert capsys.readouterr().err == "torchqm: warning: taken for its name\n"
+    with pytest.warns(UserWarning, match="after"):
+        warnings.warn("after", stacklevel=1)

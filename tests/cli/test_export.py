@@ -46,6 +46,12 @@ def test_a_run_becomes_one_file_that_says_how_it_was_trained(run_folder, net, tm
     again = tmp_path / "again.safetensors"
     assert main(["export", str(run_folder), "--out", str(again)]) == 0
     assert again.read_bytes() == out.read_bytes()
+    assert capsys.readouterr().err == ""
+    other = run_folder / "checkpoints" / "best-epoch=4.ckpt"
+    other.write_bytes(other.with_name("best-epoch=3.ckpt").read_bytes())
+    assert main(["export", str(run_folder), "--out", str(again)]) == 0
+    (line,) = capsys.readouterr().err.splitlines()  # nothing says which of them scored best
+    assert line.startswith(f"torchqm: warning: {other}: taken for its name")
 
 
 def test_what_cannot_be_exported_is_one_line(run_folder, net, tmp_path, capsys):

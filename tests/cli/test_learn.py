@@ -89,6 +89,7 @@ def test_a_run_folder_holds_everything_and_is_tested_from_it(tmp_path, monkeypat
     assert [path.name for path in folder.parent.iterdir()] == ["version_0"]
 
 
+@pytest.mark.usefixtures("plain_curves")
 def test_fine_tuning_is_a_training_that_begins_with_given_weights(tmp_path, monkeypatch):
     """As configs/experiment/finetune.yaml has it, on creatures; with no learning rate the weights stay those given."""
     monkeypatch.chdir(tmp_path)

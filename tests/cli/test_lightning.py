@@ -12,6 +12,8 @@ from torchqm.cli.console import UserError
 from torchqm.cli.learn import fit, learn
 from torchqm.cli.lightning import own_callbacks
 
+pytestmark = pytest.mark.usefixtures("plain_curves")
+
 ROOT = "synthetic:kinds=ellipsoid;poses=4;verts=500;triangulation=shared"
 
 

@@ -16,9 +16,11 @@ from pytorch_lightning.loggers import CSVLogger, TensorBoardLogger
 
 from torchqm.cli.console import UserError
 from torchqm.cli.learn import evaluate, fit
-from torchqm.cli.run_folder import place_of_test, place_of_training, read_config
+from torchqm.cli.run_folder import hold, place_of_test, place_of_training, read_config
 from torchqm.learn.callbacks import LastEpoch
 from torchqm.learn.logger import RunLogger
+
+pytestmark = pytest.mark.usefixtures("plain_curves")
 
 ROOT = "synthetic:kinds=ellipsoid;poses=6;verts=500;triangulation=shared"
 EPOCHS = 4
@@ -193,6 +195,17 @@ def test_two_trainings_do_not_share_a_folder(folder, watch, tmp_path):
     assert contents(run) == before
 
 
+def test_a_folder_is_held_by_one_alone_and_made_if_it_can_be(tmp_path):
+    run = tmp_path / "runs" / "new"
+    with hold(run), pytest.raises(UserError, match="new: another training is writing there"):
+        hold(run)
+    with hold(run):  # free again
+        pass
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match=r"file.run: the run folder cannot be made \(Not a directory\)"):
+        hold(tmp_path / "file" / "run")
+
+
 def contents(run):
     return {path: path.read_bytes() for path in run.rglob("*") if path.is_file() and "test" not in path.parts[-3:]}
 
@@ -240,8 +253,9 @@ def test_another_config_or_an_earlier_state_begins_a_run_of_its_own(folder, watc
     run = Path("runs", "version_0")
     before = contents(run)
     words = ["--config", str(run / "config.yaml"), "--trainer.logger.init_args.save_dir", "runs"]
-    for file, more in (("last.ckpt", ["--data.batch_size", "2"]), ("best-epoch=0.ckpt", ["--trainer.max_epochs", "2"])):
-        went = fit([*words, "--ckpt_path", str(run / "checkpoints" / file), *more, "--trainer.max_epochs", "5"])
+    last = ["--data.batch_size", "2", "--trainer.max_epochs", "5"]
+    for file, more in (("last.ckpt", last), ("best-epoch=0.ckpt", ["--trainer.max_epochs", "2"])):
+        went = fit([*words, "--ckpt_path", str(run / "checkpoints" / file), *more])
         new = Path(went.trainer.log_dir)
         assert f"{file}: a run of its own begins from this state" in capsys.readouterr().err
         assert [Path(path).parent for path in went.config_init["fit"]["checkpoint"].best_k_models] == [

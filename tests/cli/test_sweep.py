@@ -8,9 +8,12 @@ import pytest
 import yaml
 
 from torchqm.cli import sweep as module
+from torchqm.cli import sweep_results
 from torchqm.cli.console import Progress, UserError
-from torchqm.cli.sweep import main, run_sweep, write_tables
+from torchqm.cli.sweep import main, run_sweep
 from torchqm.cli.sweep_plan import Sweep
+
+pytestmark = pytest.mark.usefixtures("plain_curves")
 
 SCRIPT = Path(__file__).resolve().parents[2] / "train" / "sweep.py"
 
@@ -68,7 +71,7 @@ def test_a_config_that_was_changed_is_not_mixed_with_what_it_was(tmp_path):
 def test_runs_of_another_version_are_not_mixed_with_those_of_this_one(tmp_path, monkeypatch):
     run_sweep(plan(), tmp_path, progress(io.StringIO()), lambda run: {"test_orbit_error": 0.5})
     assert len(run_sweep(plan(), tmp_path, progress(io.StringIO()), never)) == 4
-    monkeypatch.setattr(module, "__version__", "9.9.9")
+    monkeypatch.setattr(sweep_results, "__version__", "9.9.9")
     with pytest.raises(UserError, match=r"k=10-seed=0: has a run of torchqm .* \(result.json\), this is 9.9.9; .*del"):
         run_sweep(plan(), tmp_path, progress(io.StringIO()), never)
     path = tmp_path / "k=10-seed=0" / "result.json"
@@ -122,21 +125,6 @@ def test_a_run_that_fails_is_in_the_table_and_the_others_go_on(tmp_path):
     again = []
     run_sweep(plan(), tmp_path, progress(io.StringIO()), lambda run: again.append(run.name) or train(run))
     assert again == ["k=20-seed=0"]  # what failed is tried again, and nothing else
-    text = write_tables([row | {"seconds": 2.0} for row in rows], ["model.k"], tmp_path)
-    assert text.splitlines() == [
-        "| model.k | seeds | seconds | test_orbit_error |",
-        "| --- | --- | --- | --- |",
-        "| 10 | 2 | 2 ± 0 | 1 ± 0.71 |",
-        "| 20 | 1 of 2 | 2 | 1.5 |",
-        "",
-        "- k=20-seed=0: failed: the loss is nan at the pairs a -> b",
-    ]
-    assert (tmp_path / "sweep.md").read_text() == text
-    with (tmp_path / "sweep.csv").open() as file:
-        table = list(csv.DictReader(file))
-    assert [(row["run"], row["seed"], row["test_orbit_error"]) for row in table] == [
-        ("k=10-seed=0", "0", "0.5"), ("k=20-seed=0", "0", ""), ("k=10-seed=1", "1", "1.5"), ("k=20-seed=1", "1", "1.5")
-    ]  # fmt: skip
 
 
 def test_folders_with_something_else_are_left_alone(tmp_path):

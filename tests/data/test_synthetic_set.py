@@ -51,6 +51,7 @@ def test_meshes_are_the_creatures_that_the_names_say_and_are_kept(own, shared):
 def test_shared_triangles_have_vertex_ids_for_truth(shared):
     truth = shared.truth("quadruped-0-pose0", "quadruped-0-pose1")
     assert torch.equal(truth.at, truth.points)
+    assert torch.equal(truth.points, shared.exact("quadruped-0-pose0", "quadruped-0-pose1").nearest_vertices()[0])
     assert len(truth) == shared.mesh("quadruped-0-pose0").n_verts
     assert "vertex ids" in truth.source
 
@@ -67,7 +68,7 @@ def test_own_triangles_have_points_in_faces_that_lie_on_the_same_place_at_rest(o
     assert set(map(tuple, truth.points.corners.sort(1).values.tolist())) <= set(
         map(tuple, own.mesh(second).faces.sort(1).values.tolist())
     )
-    assert torch.equal(own.truth(first, first).points, torch.arange(own.mesh(first).n_verts))
+    assert torch.equal(own.truth(first, first).points, own.exact(first, first).nearest_vertices()[0])
 
 
 def test_symmetry_is_the_whole_group_of_the_shape(shared):

@@ -10,7 +10,7 @@ from safetensors import safe_open
 
 from torchqm.data import ItemOptions, PairDataset, collate, open_shapes
 from torchqm.learn import MatchNet, load_net
-from torchqm.learn.files import find_weights
+from torchqm.learn.checkpoints import find_weights
 
 
 def test_it_is_small_and_says_how_it_was_made():

@@ -1,15 +1,13 @@
 import json
-import pickle
 import re
 
 import pytest
 import torch
-from pytorch_lightning import Trainer
 from safetensors.torch import load_file, save_file
 
 from torchqm.data import collate
-from torchqm.learn import MatchModule, MatchNet, NetOptions, load_net, save_net
-from torchqm.learn.files import _digest, digest, find_weights
+from torchqm.learn import MatchNet, NetOptions, load_net, save_net
+from torchqm.learn.files import _digest, digest
 
 SMALL = {"k": 20, "signature": 16, "channels": 12, "width": 24, "odd_pairs": 20}
 
@@ -17,19 +15,6 @@ SMALL = {"k": 20, "signature": 16, "channels": 12, "width": 24, "odd_pairs": 20}
 def net_of(seed=0, **more):
     torch.manual_seed(seed)
     return MatchNet(NetOptions(**(SMALL | more)))
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A run folder as Lightning leaves it, without any training."""
-    folder = tmp_path_factory.mktemp("run")
-    module = MatchModule("quotient+odd", seed=3, inputs=("wks", "xyz"), **SMALL)
-    trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False)
-    trainer.strategy.connect(module)
-    for name in ("best-epoch=9", "best-epoch=10", "last"):
-        (folder / "checkpoints").mkdir(exist_ok=True)
-        trainer.save_checkpoint(folder / "checkpoints" / f"{name}.ckpt")
-    return folder, module
 
 
 @pytest.mark.parametrize("more", [{}, {"network": "diffusion", "inputs": ("hks", "xyz")}, {"network": "none"}])
@@ -52,15 +37,6 @@ def test_equal_networks_are_equal_files_and_have_one_digest(tmp_path):
     assert files[0] == files[1]
     other = [net_of(1), net_of(tau=0.08), net_of().double(), net_of().bfloat16()]
     assert len({digest(net) for net in (net_of(), net_of(), *other)}) == 5
-
-
-def test_a_run_folder_gives_its_best_checkpoint(run):
-    folder, module = run
-    assert find_weights(folder).name == "best-epoch=10.ckpt"
-    for path in (folder, folder / "checkpoints", folder / "checkpoints" / "last.ckpt"):
-        net = load_net(path)
-        assert digest(net) == digest(module.net)
-        assert net.options.inputs == ("wks", "xyz")
 
 
 def damaged(path, content):
@@ -91,19 +67,6 @@ def test_a_changed_weight_is_noticed(tmp_path):
         load_net(damaged(tmp_path / "flipped.safetensors", bytes(content)))
 
 
-def test_bytes_that_changed_in_a_checkpoint_are_noticed(run, tmp_path):
-    """Also where the pickle is whole and torch reads it: in the numbers of a weight."""
-    content = bytearray((run[0] / "checkpoints" / "last.ckpt").read_bytes())
-    weights = max(run[1].net.state_dict().values(), key=torch.numel).numpy().tobytes()
-    at = bytes(content).index(weights)
-    content[at : at + 4] = bytes(255 - byte for byte in content[at : at + 4])
-    path = tmp_path / "flipped.ckpt"
-    path.write_bytes(content)
-    torch.load(path, weights_only=True)
-    with pytest.raises(ValueError, match=r"flipped\.ckpt: damaged, .* is not what was written"):
-        load_net(path)
-
-
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
 def test_weights_that_are_no_numbers_are_refused(value, run, tmp_path):
     net = net_of()
@@ -118,20 +81,6 @@ def test_weights_that_are_no_numbers_are_refused(value, run, tmp_path):
         load_net(tmp_path / "net.ckpt")
 
 
-def test_of_several_good_checkpoints_the_best(run, tmp_path):
-    """Not the one of the highest epoch: the last checkpoint remembers which, wherever the folder is now."""
-    folder = tmp_path / "moved" / "checkpoints"
-    folder.mkdir(parents=True)
-    for path in (run[0] / "checkpoints").iterdir():
-        (folder / path.name).write_bytes(path.read_bytes())
-    content = torch.load(folder / "last.ckpt", weights_only=True)
-    content["callbacks"] = {"Other": {}, "Best": {"best_model_path": "/elsewhere/checkpoints/best-epoch=9.ckpt"}}
-    torch.save(content, folder / "last.ckpt")
-    assert find_weights(tmp_path / "moved") == folder / "best-epoch=9.ckpt"
-    (folder / "best-epoch=9.ckpt").unlink()
-    assert find_weights(tmp_path / "moved") == folder / "best-epoch=10.ckpt"
-
-
 def test_a_file_that_knows_fewer_options_is_read_with_their_defaults(tmp_path):
     """As one of an earlier version would be; its weights are still checked."""
     path, net = tmp_path / "early.safetensors", net_of()
@@ -139,19 +88,6 @@ def test_a_file_that_knows_fewer_options_is_read_with_their_defaults(tmp_path):
     head = {"format": 1, "options": options, "digest": _digest(options, net.state_dict())}
     save_file(net.state_dict(), path, {"torchqm": json.dumps(head)})
     assert load_net(path).options == net.options
-
-
-class Evil:
-    def __reduce__(self):
-        return print, ("executed",)
-
-
-def test_nothing_in_a_checkpoint_is_executed(tmp_path, capsys):
-    for name, save in (("zip.ckpt", torch.save), ("raw.ckpt", lambda v, p: p.write_bytes(pickle.dumps(v)))):
-        save({"state_dict": {}, "hyper_parameters": {"k": Evil()}}, tmp_path / name)
-        with pytest.raises(ValueError, match=rf"{name}: damaged, or holds more than weights"):
-            load_net(tmp_path / name)
-    assert "executed" not in capsys.readouterr().out
 
 
 def test_weights_of_another_architecture_are_listed(tmp_path, run):
@@ -188,15 +124,6 @@ def test_safetensors_of_others_are_refused(head, message, tmp_path):
     save_file({"weight": torch.ones(2)}, path, None if head is None else {"torchqm": head})
     with pytest.raises(ValueError, match=rf"foreign\.safetensors: .*{message}"):
         load_net(path)
-
-
-@pytest.mark.parametrize(
-    "content", [{"model": torch.ones(1)}, [1], {"state_dict": {}, "hyper_parameters": {"hidden": 3}}]
-)
-def test_checkpoints_of_others_are_refused(content, tmp_path):
-    torch.save(content, tmp_path / "foreign.ckpt")
-    with pytest.raises(ValueError, match=r"foreign\.ckpt: no checkpoint of torchqm\.learn\.MatchModule"):
-        load_net(tmp_path / "foreign.ckpt")
 
 
 def test_paths_that_lead_to_no_network_are_named(tmp_path):

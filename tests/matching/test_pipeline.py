@@ -604,7 +604,7 @@ class TestLargeGroups:
     @pytest.mark.parametrize(("kind", "order"), [("octopus", 16), ("ellipsoid", 8)])
     def test_rest_to_rest(self, kind, order):
         source, target = (creature(kind, 1000, retriangulate=seed) for seed in (1, 2))
-        found = match(source.mesh, target.mesh, parameters=MatchParameters(k_max=80))
+        found = match(source.mesh, target.mesh, parameters=MatchParameters(k_max=60))
         assert found.maps.shape == (order, source.mesh.n_verts)
         assert found.orbits.shape == (source.mesh.n_verts, order)
         assert found.fmaps.shape[0] == order
@@ -698,12 +698,13 @@ def test_seconds_are_those_of_this_match(pair):
 def test_workers_and_a_cache_change_nothing(tmp_path):
     """Two shapes looked at, and read, at the same time, on two threads: the same maps, labels and names of steps."""
     source, target = creature("quadruped", 500, pose=1, retriangulate=1), creature("quadruped", 500, pose=2)
+    small = MatchParameters(k=20, k_max=40, n_descriptors=20, n_samples=300)
     before = torch.get_num_threads()
     results = []
     for threads, cache in ((1, tmp_path), (2, tmp_path)):
         torch.set_num_threads(threads)
         try:
-            collection = Collection(parameters=FAST, cache_dir=cache)
+            collection = Collection(parameters=small, cache_dir=cache)
             results.append(collection.match(source.mesh, target.mesh))
             again = collection.match(target.mesh, source.mesh)  # nothing is left to be found
         finally:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import trimesh
+from scipy.spatial import cKDTree
 
 from torchqm.geometry import Mesh
 from torchqm.spectral import SpectralBasis, mesh_basis
@@ -28,10 +29,8 @@ def icosphere(level: int = 3) -> Mesh:
 
 def permutation_of(verts: np.ndarray, linear: np.ndarray) -> np.ndarray:
     """The vertex permutation of an orthogonal map that sends the vertex set to itself."""
-    images = verts @ linear.T
-    distance = ((images[:, None] - verts[None]) ** 2).sum(-1)
-    permutation = distance.argmin(1)
-    assert distance.min(1).max() < 1e-20
+    distance, permutation = cKDTree(verts).query(verts @ linear.T)
+    assert distance.max() < 1e-10
     assert np.unique(permutation).size == len(verts)
     return permutation
 

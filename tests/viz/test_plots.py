@@ -9,7 +9,7 @@ from PIL import Image
 from torchqm.geometry.mesh import Mesh
 from torchqm.viz import (
     bar_figure,
-    cumulative_curve,
+    curve_points,
     error_curves,
     line_figure,
     match_figure,
@@ -126,8 +126,8 @@ def test_scalar_figure_gives_each_kind_of_field_its_colour_bar(tmp_path, drawn):
     assert drawn[0]["ticks"][2] == ["5", "7"]
 
 
-def test_cumulative_curve_counts_exactly():
-    x, y = cumulative_curve(torch.tensor([0.1, 0.0, 0.2, 0.9]).double().round(decimals=6), xlim=0.2)
+def test_points_of_a_curve_count_exactly():
+    x, y = curve_points(torch.tensor([0.1, 0.0, 0.2, 0.9]).double().round(decimals=6), xlim=0.2)
     assert (x[0], x[-1]) == (0, 0.2)
     assert (y[0], y[249], y[250], y[-1]) == (0.25, 0.25, 0.5, 0.75)
 

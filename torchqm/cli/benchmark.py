@@ -9,8 +9,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from torchqm.cli.backends import add_backend, check_backend
-from torchqm.cli.benchmark_help import DESCRIPTION, Help
+from torchqm.cli.backends import check_backend
+from torchqm.cli.benchmark_help import DESCRIPTION, add_options
 from torchqm.cli.cluster import connected
 from torchqm.cli.console import Progress, UserError
 from torchqm.cli.inputs import as_plain
@@ -22,9 +22,7 @@ if TYPE_CHECKING:
     from torchqm.benchmark.summary import PublishedRows
     from torchqm.data.base import ShapeSet
 
-__all__ = ["DEFAULT_METHODS", "FILES", "add_parser", "run"]
-
-DEFAULT_METHODS = "quotient,zoomout,fmap,descriptors"
+__all__ = ["FILES", "add_parser", "run"]
 
 _RunAll = Callable[[Callable[[Any], Any], "Sequence[Task]"], Iterable[tuple[int, Any]]]
 """Does work for tasks and gives the number and result of each as they come."""
@@ -42,56 +40,7 @@ def add_parser(commands: Any) -> None:
         allow_abbrev=False,
         add_help=False,
     )
-    parser.add_argument("-h", "--help", action=Help)
-    parser.add_argument(
-        "root", metavar="ROOT", help="the set of shapes, see 'torchqm data check --help': a folder, or 'synthetic:'"
-    )
-    parser.add_argument(
-        "--methods", default=DEFAULT_METHODS, metavar="A,B,...", help="which methods, see below (default %(default)s)"
-    )
-    parser.add_argument(
-        "--pairs",
-        default=None,
-        metavar="SPEC",
-        help="which pairs, see below (default: the published ones if the set has them, else within-class)",
-    )
-    parser.add_argument("--limit", type=_count, metavar="N", help="only the first N pairs")
-    parser.add_argument(
-        "--out", type=Path, default=Path("torchqm-benchmark"), metavar="DIR", help="default: %(default)s"
-    )
-    parser.add_argument(
-        "--jobs",
-        type=_count,
-        metavar="N",
-        help="processes of one thread each (default: all cores); with dask: pairs at a time (default: one a worker)",
-    )
-    add_backend(parser)
-    parser.add_argument(
-        "--cache",
-        type=Path,
-        metavar="DIR",
-        help="eigenfunctions ('torchqm prepare') and distances (default: the folder that TORCHQM_CACHE names, else "
-        "OUT/cache)",
-    )
-    parser.add_argument(
-        "--points",
-        type=_points,
-        default=100,
-        metavar="N",
-        help="points at which errors are measured, spread over the shape (default 100); all: all that the truth has; "
-        "landmarks: those of the class (SCB), where published errors with a flip forgiven were measured",
-    )
-    parser.add_argument(
-        "--solver",
-        choices=("fast_marching", "heat", "dijkstra"),
-        default="fast_marching",
-        help="of geodesic distances (default fast_marching; dijkstra to compare with old papers)",
-    )
-    parser.add_argument(
-        "--worst", type=_natural, default=3, metavar="N", help="pairs a method on worst.html (default 3)"
-    )
-    parser.add_argument("--retry", action="store_true", help="run those again that failed before")
-    parser.add_argument("--report", action="store_true", help="run nothing, report what is there")
+    add_options(parser)
     parser.set_defaults(run=run, threads=None, default_threads=1)
 
 
@@ -283,22 +232,3 @@ def _report(
     failed = sum(bool(row.get("reason")) for row in rows)
     print(f"written: {', '.join(str(out / name) for name in (*FILES, *sorted(set(files) - {'csv', 'table'})))}")
     return 1 if failed else 0
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text}: at least 1")
-    return value
-
-
-def _natural(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text}: at least 0")
-    return value
-
-
-def _points(text: str) -> int:
-    """A number of points; 0 stands for all, -1 for the landmarks."""
-    return {"all": 0, "landmarks": -1}.get(text) if text in ("all", "landmarks") else _count(text)  # type: ignore[return-value]

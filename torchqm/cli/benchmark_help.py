@@ -1,13 +1,17 @@
-"""What ``torchqm benchmark --help`` says."""
+"""The options of ``torchqm benchmark``, and what its ``--help`` says."""
 
 import argparse
 import textwrap
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from torchqm.catalogue import DESCRIPTIONS, PAIRS_HELP, PUBLISHED_METHODS
+from torchqm.cli.backends import add_backend
 
-__all__ = ["DESCRIPTION", "Help"]
+__all__ = ["DEFAULT_METHODS", "DESCRIPTION", "Help", "add_options"]
+
+DEFAULT_METHODS = "quotient,zoomout,fmap,descriptors"
 
 DESCRIPTION = """\
 Run methods on pairs of a set of shapes and compare them: a table, the error curves of the
@@ -65,3 +69,76 @@ class Help(argparse.Action):
         parser.epilog = _EPILOG.format(methods=methods, published=", ".join(PUBLISHED_METHODS), pairs=pairs)
         parser.print_help()
         parser.exit()
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """All options of the command."""
+    parser.add_argument("-h", "--help", action=Help)
+    parser.add_argument(
+        "root", metavar="ROOT", help="the set of shapes, see 'torchqm data check --help': a folder, or 'synthetic:'"
+    )
+    parser.add_argument(
+        "--methods", default=DEFAULT_METHODS, metavar="A,B,...", help="which methods, see below (default %(default)s)"
+    )
+    parser.add_argument(
+        "--pairs",
+        default=None,
+        metavar="SPEC",
+        help="which pairs, see below (default: the published ones if the set has them, else within-class)",
+    )
+    parser.add_argument("--limit", type=_count, metavar="N", help="only the first N pairs")
+    parser.add_argument(
+        "--out", type=Path, default=Path("torchqm-benchmark"), metavar="DIR", help="default: %(default)s"
+    )
+    parser.add_argument(
+        "--jobs",
+        type=_count,
+        metavar="N",
+        help="processes of one thread each (default: all cores); with dask: pairs at a time (default: one a worker)",
+    )
+    add_backend(parser)
+    parser.add_argument(
+        "--cache",
+        type=Path,
+        metavar="DIR",
+        help="eigenfunctions ('torchqm prepare') and distances (default: the folder that TORCHQM_CACHE names, else "
+        "OUT/cache)",
+    )
+    parser.add_argument(
+        "--points",
+        type=_points,
+        default=100,
+        metavar="N",
+        help="points at which errors are measured, spread over the shape (default 100); all: all that the truth has; "
+        "landmarks: those of the class (SCB), where published errors with a flip forgiven were measured",
+    )
+    parser.add_argument(
+        "--solver",
+        choices=("fast_marching", "heat", "dijkstra"),
+        default="fast_marching",
+        help="of geodesic distances (default fast_marching; dijkstra to compare with old papers)",
+    )
+    parser.add_argument(
+        "--worst", type=_natural, default=3, metavar="N", help="pairs a method on worst.html (default 3)"
+    )
+    parser.add_argument("--retry", action="store_true", help="run those again that failed before")
+    parser.add_argument("--report", action="store_true", help="run nothing, report what is there")
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text}: at least 1")
+    return value
+
+
+def _natural(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text}: at least 0")
+    return value
+
+
+def _points(text: str) -> int:
+    """A number of points; 0 stands for all, -1 for the landmarks."""
+    return {"all": 0, "landmarks": -1}.get(text) if text in ("all", "landmarks") else _count(text)  # type: ignore[return-value]

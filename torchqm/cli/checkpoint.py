@@ -3,7 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from torchqm.cli.console import UserError
+from torchqm.cli.console import UserError, warnings_as_lines
 
 if TYPE_CHECKING:
     from torchqm.learn import LearnedDescriptors
@@ -36,6 +36,7 @@ def read_checkpoint(path: str | None) -> "LearnedDescriptors | None":
     from torchqm.learn import LearnedDescriptors, load_net
 
     try:
-        return LearnedDescriptors(load_net(path))
+        with warnings_as_lines():
+            return LearnedDescriptors(load_net(path))
     except ValueError as error:
         raise UserError(str(error)) from error

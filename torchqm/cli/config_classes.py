@@ -6,6 +6,7 @@ from difflib import get_close_matches
 from importlib import import_module
 from inspect import signature
 from pkgutil import iter_modules
+from typing import Any
 
 __all__ = ["allowed", "arguments_of", "class_fault"]
 
@@ -74,7 +75,8 @@ def _hint(name: str, names: list[str], front: str) -> str:
 def _below(class_path: str) -> Iterator[type]:
     """The classes that are loaded and made from one."""
     module, _, name = class_path.rpartition(".")
-    above = [getattr(import_module(module), name)]
+    first = getattr(import_module(module), name)
+    above: list[type[Any]] = [first] if isinstance(first, type) else []  # typing.Union is none
     while above:
         for one in above.pop().__subclasses__():
             above.append(one)

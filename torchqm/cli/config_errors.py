@@ -1,12 +1,11 @@
 """What jsonargparse says about a config or an argument that is wrong, as one line: where, what, and the nearest key."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from difflib import SequenceMatcher
-from pathlib import Path
-from typing import Any
 
 from torchqm.cli.config_classes import allowed, arguments_of, class_fault
+from torchqm.cli.config_places import files_of, on_one_line, place_of
 
 __all__ = ["explained", "nearest_key", "placed"]
 
@@ -29,7 +28,7 @@ def explained(message: str, keys: Sequence[str], args: Sequence[str]) -> str:
         >>> explained('Parser key "model.k": Expected a <class \'int\'>. Got value: ten', ["model.k"], [])
         "model.k: 'ten' given, expected int"
     """
-    files = list(_files(args))
+    files = files_of(args)
     if faults := [f"{path}: not readable as YAML ({error})" for path, _, error in files if error]:
         return faults[0]
     if found := re.search(r"unrecognized arguments: (\S+)", message):
@@ -38,29 +37,31 @@ def explained(message: str, keys: Sequence[str], args: Sequence[str]) -> str:
             return f"{word}: not expected here; options begin with '--'"
         return f"{word}: no such option; {_hint(word.removeprefix('--'), keys, '--')}"
     if found := re.search(r"does not accept option '([^']+)'", message):
-        return f"{_place(found[1], args, files)}: no such key; {_hint(found[1], keys)}"
+        return f"{place_of(found[1], args, files)}: no such key; {_hint(found[1], keys)}"
     head = re.match(r'(?:Parser key|argument) (?:--|")?([\w.]+)"?:', message)
     inner = re.search(r"Problem with given class_path '([^']+)':\s+Option '([^']+)' is not accepted", message)
     if head and inner:
         key = f"{head[1]}.init_args.{inner[2]}"
-        return f"{_place(key, args, files)}: {inner[1]} has no such argument; {_hint(inner[2], arguments_of(inner[1]))}"
+        return (
+            f"{place_of(key, args, files)}: {inner[1]} has no such argument; {_hint(inner[2], arguments_of(inner[1]))}"
+        )
     if found := re.fullmatch(
         r"the following arguments are required: (?:fit\.|test\.|predict\.)?([\w.]+)", message.strip()
     ):
         return f"--{found[1]}: not given, but needed"
     if head and (fault := class_fault(message)):
-        return f"{_place(head[1], args, files)}: {fault}"
+        return f"{place_of(head[1], args, files)}: {fault}"
     key = head[1] if head else ""
     if head and (inside := re.search(_IN_CLASS, message, re.DOTALL)):
         key, message = f"{key}.init_args.{inside[1]}", inside[2]
     expected = allowed(message)
     given = re.search(r"(?:Got value|Given value): (.*)", message, re.DOTALL)
     if head and expected and given:
-        return f"{_place(key, args, files)}: {_joined(given[1])!r} given, expected {expected}"
-    if head and (rest := _joined(message[head.end() :])):
+        return f"{place_of(key, args, files)}: {on_one_line(given[1])!r} given, expected {expected}"
+    if head and (rest := on_one_line(message[head.end() :])):
         dashes = "--" if message.startswith("argument --") else ""
-        return f"{dashes + head[1] if dashes else _place(head[1], args, files)}: {rest}"
-    return _joined(message)
+        return f"{dashes + head[1] if dashes else place_of(head[1], args, files)}: {rest}"
+    return on_one_line(message)
 
 
 def placed(text: str, keys: Sequence[str], args: Sequence[str]) -> str:
@@ -82,7 +83,7 @@ def placed(text: str, keys: Sequence[str], args: Sequence[str]) -> str:
         return text
     groups = (found[1],) if found[1] else _GROUPS
     key = next((f"{group}.{found[2]}" for group in groups if f"{group}.{found[2]}" in keys), None)
-    return text if key is None else f"{_place(key, args, list(_files(args)))}{text[found.end() :]}"
+    return text if key is None else f"{place_of(key, args, files_of(args))}{text[found.end() :]}"
 
 
 def nearest_key(key: str, keys: Sequence[str]) -> str | None:
@@ -106,49 +107,3 @@ def nearest_key(key: str, keys: Sequence[str]) -> str | None:
 def _hint(key: str, keys: Sequence[str], dashes: str = "") -> str:
     near = nearest_key(key, keys)
     return f"the nearest is {dashes}{near}" if near else "none is near; see --help"
-
-
-def _place(key: str, args: Sequence[str], files: Sequence[tuple[Path, dict[str, Any], str]]) -> str:
-    """The key, after the file that has it; on the command line, which comes last, with its dashes."""
-    if any(re.fullmatch(rf"--{re.escape(key)}(=.*)?", arg) for arg in args):
-        return f"--{key}"
-    holders = [path for path, values, _ in files if _has(values, key)]
-    return f"{holders[-1]}: {key}" if holders else key
-
-
-def _has(values: Any, key: str) -> bool:
-    if isinstance(values, dict) and key in values:
-        return True
-    first, _, rest = key.partition(".")
-    return isinstance(values, dict) and bool(rest) and _has(values.get(first), rest)
-
-
-def _files(args: Sequence[str]) -> Iterator[tuple[Path, dict[str, Any], str]]:
-    """Each YAML file among the arguments and those that they name: its values, below their group, and its fault."""
-    for option, value in zip(args, [*args[1:], ""], strict=False):
-        name, _, joined = option.partition("=")
-        if name in ("--config", "-c"):
-            yield from _file(Path(joined or value), "")
-        elif re.fullmatch(r"--\w+", name) and (joined or value).endswith((".yaml", ".yml", ".json")):
-            yield from _file(Path(joined or value), name.removeprefix("--"))
-
-
-def _file(path: Path, group: str, above: tuple[Path, ...] = ()) -> Iterator[tuple[Path, dict[str, Any], str]]:
-    import yaml
-
-    if not path.is_file() or path.resolve() in above:  # a file that names itself would have no end
-        return
-    try:
-        values = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-        yield path, {}, _joined(str(error))
-        return
-    yield path, {group: values} if group else values, ""
-    if isinstance(values, dict):
-        for key, value in values.items():
-            if isinstance(value, str) and value.endswith((".yaml", ".yml", ".json")):
-                yield from _file(path.parent / value, key, (*above, path.resolve()))
-
-
-def _joined(text: str) -> str:
-    return " ".join(text.split())

@@ -2,12 +2,13 @@
 
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from time import perf_counter
 from typing import Any
 
-__all__ = ["Progress", "UserError", "format_table", "print_seconds", "print_warnings"]
+__all__ = ["Progress", "UserError", "format_table", "print_seconds", "print_warnings", "warnings_as_lines"]
 
 
 class UserError(Exception):
@@ -130,6 +131,23 @@ def print_seconds(seconds: dict[str, float]) -> None:
     """The table of seconds per step, with their sum."""
     rows = [[name, f"{value:.2f}"] for name, value in seconds.items()]
     print(format_table(["step", "seconds"], [*rows, ["total", f"{sum(seconds.values()):.2f}"]]))
+
+
+@contextmanager
+def warnings_as_lines() -> Iterator[None]:
+    """A warning for the user is one line on stderr, without the place in the code."""
+    plain = warnings.showwarning
+
+    def show(message: Any, category: type[Warning], *rest: Any, **more: Any) -> None:
+        if category is UserWarning:
+            print_warnings([str(message)])
+        else:
+            plain(message, category, *rest, **more)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = show
+        yield
 
 
 def print_warnings(warnings: Sequence[str]) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from torchqm.cli.checkpoint import CHECKPOINT_HELP
-from torchqm.cli.console import UserError
+from torchqm.cli.console import UserError, warnings_as_lines
 
 __all__ = ["add_parser", "run"]
 
@@ -33,10 +33,12 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Read a checkpoint and write it anew."""
-    from torchqm.learn.files import digest, find_weights, load_net, save_net
+    from torchqm.learn.checkpoints import find_weights
+    from torchqm.learn.files import digest, load_net, save_net
 
     try:
-        found = find_weights(arguments.run_path)
+        with warnings_as_lines():
+            found = find_weights(arguments.run_path)
         net = load_net(found)
         path = save_net(net, arguments.out, _about(found))
     except ValueError as error:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchqm.cli.console import UserError
+from torchqm.cli.console import UserError, warnings_as_lines
 from torchqm.cli.yaml_file import read_yaml
 
 if TYPE_CHECKING:
@@ -73,10 +73,11 @@ def evaluate(args: Sequence[str]) -> "LightningCLI":
     if not args or args[0].startswith("-"):
         return learn(["test", *args])
     config = _config(Path(args[0]))
-    from torchqm.learn.files import find_weights
+    from torchqm.learn.checkpoints import find_weights
 
     try:
-        found = find_weights(config.parent)
+        with warnings_as_lines():
+            found = find_weights(config.parent)
     except ValueError as error:
         raise UserError(str(error)) from error
     return learn(["test", "--config", str(config), "--ckpt_path", str(found), *args[1:]])

@@ -3,27 +3,24 @@
 import sys
 import warnings
 from argparse import ArgumentError
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import Any
 
 import yaml
-from filelock import FileLock, Timeout
 from pytorch_lightning import Callback, Trainer
 from pytorch_lightning.cli import ArgsType, LightningArgumentParser, LightningCLI
-from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
-from torchqm.cli.agreement import check_monitor, check_truth, first_truths, without_truth
-from torchqm.cli.config_errors import explained, placed
+from torchqm.cli.agreement import check_monitor, check_truth, first_truths
+from torchqm.cli.config_errors import explained
+from torchqm.cli.config_faults import stops, value_faults
 from torchqm.cli.console import UserError
 from torchqm.cli.inputs import shape_faults
 from torchqm.cli.learn import Interrupted
-from torchqm.cli.run_folder import Place, RunConfig, place_of_test, place_of_training, read_config
-from torchqm.data.base import TruthError
+from torchqm.cli.run_folder import Place, RunConfig, hold, place_of_test, place_of_training, read_config
 from torchqm.data.datamodule import PairDataModule
 from torchqm.learn.callbacks import BestCheckpoint, LastEpoch, Versions
-from torchqm.learn.faults import StepError
 from torchqm.learn.logger import RunLogger
 from torchqm.learn.module import MatchModule
 from torchqm.learn.options import NetOptions
@@ -71,7 +68,7 @@ class MatchCLI(LightningCLI):
         # Its own checkpoints, where a run goes on in its folder.
         warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")
         once = {"exit_on_error": False, "allow_abbrev": False}
-        with shape_faults(), _stops(), ExitStack() as held:
+        with shape_faults(), stops(args), ExitStack() as held:
             return cls(
                 MatchModule,
                 PairDataModule,
@@ -86,7 +83,7 @@ class MatchCLI(LightningCLI):
                 parser_kwargs={
                     "prog": "torchqm",
                     **once,
-                    **{name: {"description": text, **once} for name, text in _ABOUT.items()},
+                    **{name: {"description": text, **once} for name, text in _about(args).items()},
                 },
                 trainer_defaults={
                     "callbacks": own_callbacks(),
@@ -94,10 +91,9 @@ class MatchCLI(LightningCLI):
                 },
             )
 
-    @staticmethod
-    def subcommands() -> dict[str, set[str]]:
+    def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]  # Lightning asks the object, too
         """Those that there is a module and data for."""
-        return {name: found for name, found in LightningCLI.subcommands().items() if name in _ABOUT}
+        return {name: found for name, found in LightningCLI.subcommands().items() if name in _about(self._words)}
 
     def parse_arguments(self, parser: LightningArgumentParser, args: ArgsType) -> None:
         """Parse.
@@ -170,21 +166,23 @@ class MatchCLI(LightningCLI):
             folder = getattr(self.trainer.logger, "log_dir", None) if subcommand == "fit" else None
             raise Interrupted(folder) from stop
 
-    @contextmanager
-    def _values(self) -> Iterator[None]:
-        """Values of a config that do not fit are the user's to put right; so is a package that is not there."""
-        try:
-            yield
-        except TruthError as error:
-            raise UserError(without_truth(error)) from error
-        except (ValueError, OSError, ImportError, MisconfigurationException) as error:
-            parser = self.parser if self.subcommand is None else self._parser(self.subcommand)
-            raise UserError(placed(str(error), _keys_of(parser), self._words)) from error
+    def _values(self, option: str = "") -> AbstractContextManager[None]:
+        """Values of a config that do not fit are told with their option, else with this one."""
+
+        def keys() -> list[str]:
+            return _keys_of(self.parser if self.subcommand is None else self._parser(self.subcommand))
+
+        return value_faults(self._words, keys, option)
+
+    def _set_seed(self) -> None:
+        with self._values("seed_everything"):
+            super()._set_seed()
 
     def _trainer(self, **kwargs: Any) -> Trainer:
         try:
-            return super().instantiate_trainer(**kwargs)
-        except RuntimeError as error:
+            with self._values("trainer"):
+                return super().instantiate_trainer(**kwargs)
+        except UserError as error:
             if "stateful callback" not in str(error):
                 raise
             name = str(error).split("`")[1]
@@ -211,34 +209,12 @@ class MatchCLI(LightningCLI):
                 truth = self.datamodule.hparams["truth"] != "none"
                 if not own:
                     check_monitor(self._get(self.config, "checkpoint.monitor"), self.model.hparams, truth)
-        if self.trainer.is_global_zero:
-            self._lock()
-            if self._place is not None:
-                self._tell(self._place, self._state)
-
-    def _lock(self) -> None:
-        """Hold the folder until the end: two runs in it would write into each other's metrics and checkpoints."""
-        logger = next((logger for logger in self.trainer.loggers if isinstance(logger, RunLogger)), None)
-        if logger is None:
+        if not self.trainer.is_global_zero:
             return
-        folder = Path(logger.log_dir)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._held.enter_context(FileLock(folder / ".lock", timeout=0))
-        except Timeout as error:
-            raise UserError(f"{folder}: another training is writing there") from error
-
-    def _tell(self, place: Place, state: TrainingState | None) -> None:
-        if place.folder is None:
-            text = "" if state is None else f"{state.path}: a run of its own begins from this state"
-        elif state is None or not place.goes_on:
-            text = f"{place.folder}: no epoch was finished, so that it begins anew"
-        else:
-            most = self.trainer.max_epochs
-            done = most is not None and 0 <= most <= state.epochs
-            more = "; that is all it was to do, more is done with --trainer.max_epochs N" if done else ""
-            text = f"{place.folder}: goes on after {state.epochs} epochs, {state.steps} steps{more}"
-        if text:
+        logger = next((logger for logger in self.trainer.loggers if isinstance(logger, RunLogger)), None)
+        if logger is not None:
+            self._held.enter_context(hold(Path(logger.log_dir)))
+        if self._place is not None and (text := self._place.news(self._state, self.trainer.max_epochs)):
             print(f"torchqm: {text}", file=sys.stderr)
 
     def before_test(self) -> None:
@@ -264,20 +240,14 @@ class MatchCLI(LightningCLI):
         )
 
 
+def _about(words: Sequence[str]) -> dict[str, str]:
+    """What each subcommand does; the one that is called alone, since making the parser of one takes a while."""
+    return {name: text for name, text in _ABOUT.items() if name in words[:1]} or _ABOUT
+
+
 def _keys_of(parser: Any) -> list[str]:
     return sorted({*parser.get_defaults().keys(), *(action.dest for action in parser._actions)})
 
 
 def _keys(network: str, gradients: bool) -> list[str]:
     return list(NetOptions(network=network, gradients=gradients).keys)
-
-
-@contextmanager
-def _stops() -> Iterator[None]:
-    """A run that cannot go on is told in one line; every other exception is a bug and keeps its traceback."""
-    try:
-        yield
-    except TruthError as error:
-        raise UserError(without_truth(error)) from error
-    except (StepError, MisconfigurationException) as error:
-        raise UserError(str(error)) from error

@@ -2,10 +2,12 @@
 
 import os
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from pytorch_lightning import LightningModule, Trainer
 from pytorch_lightning.cli import SaveConfigCallback
 from pytorch_lightning.loggers import CSVLogger, Logger, TensorBoardLogger
@@ -16,8 +18,9 @@ from torchqm.cli.yaml_file import read_yaml
 from torchqm.learn.callbacks import LAST
 from torchqm.learn.logger import RunLogger
 from torchqm.learn.run_files import write_version
+from torchqm.learn.state import TrainingState
 
-__all__ = ["Place", "RunConfig", "place_of_test", "place_of_training", "read_config"]
+__all__ = ["Place", "RunConfig", "hold", "place_of_test", "place_of_training", "read_config"]
 
 _LOGGER = "--trainer.logger"
 
@@ -40,6 +43,21 @@ class Place:
     def goes_on(self) -> bool:
         """Whether the checkpoint is that of the folder: a run whose first epoch was not finished has none."""
         return self.folder is not None and self.checkpoint == str(_last(self.folder))
+
+    def news(self, state: TrainingState | None, most: int | None) -> str:
+        """What a user is told who did not ask for a new run; empty where there is nothing to tell.
+
+        Args:
+            state: of the checkpoint.
+            most: epochs that are to be done.
+        """
+        if self.folder is None:
+            return "" if state is None else f"{state.path}: a run of its own begins from this state"
+        if state is None or not self.goes_on:
+            return f"{self.folder}: no epoch was finished, so that it begins anew"
+        done = most is not None and 0 <= most <= state.epochs
+        more = "; that is all it was to do, more is done with --trainer.max_epochs N" if done else ""
+        return f"{self.folder}: goes on after {state.epochs} epochs, {state.steps} steps{more}"
 
     def at(self, steps: int) -> "Place":
         """The loggers of a run that is gone on with keep what was logged before so many steps."""
@@ -115,6 +133,21 @@ class RunConfig(SaveConfigCallback):
         self.already_saved = True
         if trainer.is_global_zero:
             write_version(Path(given) / CONFIG_NAME, self.parser.dump(self.config, skip_none=False))
+
+
+def hold(folder: Path) -> AbstractContextManager[Any]:
+    """Hold a run folder, made if need be: two runs in it would write into each other's metrics and checkpoints.
+
+    Raises:
+        UserError: another process holds it, or it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return FileLock(folder / ".lock", timeout=0).acquire()
+    except Timeout as error:
+        raise UserError(f"{folder}: another training is writing there") from error
+    except OSError as error:
+        raise UserError(f"{folder}: the run folder cannot be made ({error.strerror or error})") from error
 
 
 def read_config(folder: Path) -> dict[str, Any]:

@@ -1,25 +1,20 @@
-"""One config trained and tested over seeds and set-ups, and one table of what came out."""
+"""One config trained and tested over seeds and set-ups."""
 
 import argparse
-import csv
-import io
-import json
 import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from statistics import mean, stdev
 from time import perf_counter
 from typing import Any
 
 from torchqm.cli.console import Progress, UserError
-from torchqm.cli.sweep_plan import Run, Sweep, read_sweep, runs_of, word
+from torchqm.cli.sweep_plan import Run, Sweep, read_sweep, runs_of
+from torchqm.cli.sweep_results import RESULT, STARTED, kept_result, write_result, write_tables
 from torchqm.version import __version__
 
-__all__ = ["fit_and_test", "main", "run_sweep", "write_tables"]
-
-_RESULT, _STARTED = "result.json", "started.json"
+__all__ = ["fit_and_test", "main", "run_sweep"]
 
 _DESCRIPTION = """\
 Train and test a config with each seed, set-up and value of a grid. A run that is finished is
@@ -45,7 +40,7 @@ def run_sweep(sweep: Sweep, out: Path, progress: Progress, train: Callable[[Run]
             torchqm, or something that is no run.
     """
     runs = runs_of(sweep, out)
-    kept = {run.name: _kept(out / run.name, run) for run in runs}
+    kept = {run.name: kept_result(out / run.name, run) for run in runs}
     waiting = [run.name for run in runs if kept[run.name] is None]
     rows = []
     for run in runs:
@@ -56,7 +51,7 @@ def run_sweep(sweep: Sweep, out: Path, progress: Progress, train: Callable[[Run]
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
             about = {"arguments": list(run.arguments), "config": run.digest, "torchqm": __version__}
-            _write(folder / _STARTED, about)
+            write_result(folder / STARTED, about)
             progress.listener(run.name, -1.0, number / len(waiting))
             begin = perf_counter()
             try:
@@ -65,37 +60,11 @@ def run_sweep(sweep: Sweep, out: Path, progress: Progress, train: Callable[[Run]
                 values, status = {}, f"failed: {' '.join(str(error).split())}"
             seconds = perf_counter() - begin
             result = {**about, "status": status, "seconds": seconds, "values": values}
-            _write(folder / _RESULT, result)
+            write_result(folder / RESULT, result)
             progress.listener(run.name, seconds, (number + 1) / len(waiting))
         head = {"run": run.name, **run.labels, "seed": run.seed, "status": result["status"]}
         rows.append(head | {"seconds": round(result["seconds"], 1)} | result["values"])
     return rows
-
-
-def write_tables(rows: Sequence[Mapping[str, Any]], labels: Sequence[str], out: Path) -> str:
-    """Write ``sweep.csv``, a row for each run, and ``sweep.md``, mean and deviation over seeds; the latter's text."""
-    from torchqm.geometry.files import write_whole
-
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    table = io.StringIO()
-    writer = csv.DictWriter(table, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    values = [name for name in columns if name not in {"run", *labels, "seed", "status"}]
-    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault(tuple(word(row.get(label, "")) for label in labels), []).append(row)
-    lines = [[*labels, "seeds", *values], ["---"] * (len(labels) + 1 + len(values))]
-    for point, members in groups.items():
-        done = [row for row in members if row["status"] == "done"]
-        count = f"{len(done)}" if len(done) == len(members) else f"{len(done)} of {len(members)}"
-        lines.append([*point, count, *(_spread([row[name] for row in done if name in row]) for name in values)])
-    text = "".join(f"| {' | '.join(line)} |\n" for line in lines)
-    failed = [f"- {row['run']}: {row['status']}\n" for row in rows if row["status"] != "done"]
-    text += "\n" + "".join(failed) if failed else ""
-    write_whole(out / "sweep.csv", lambda file: file.write(table.getvalue().encode()))
-    write_whole(out / "sweep.md", lambda file: file.write(text.encode()))
-    return text
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -230,50 +199,3 @@ def _seeds(text: str) -> list[int]:
     if any(not 0 <= seed < 2**32 for seed in seeds):
         raise ValueError(text)  # argparse says which argument it was
     return seeds
-
-
-def _spread(values: Sequence[float]) -> str:
-    if not values:
-        return ""
-    return f"{mean(values):.4g}" + (f" ± {stdev(values):.2g}" if len(values) > 1 else "")
-
-
-def _kept(folder: Path, run: Run) -> Any:
-    """The result of a finished run, None if it must be run."""
-    if not folder.exists():
-        return None
-    for name in (_RESULT, _STARTED):
-        if (folder / name).is_file():
-            found = _read(folder / name)
-            if found.get("config") != run.digest:
-                raise UserError(
-                    f"{folder}: has a run of a config that was changed since ({name}); its results would be mixed with "
-                    "others: take another folder, or delete this one"
-                )
-            if found.get("torchqm") != __version__:
-                was = f"torchqm {found['torchqm']}" if "torchqm" in found else "an earlier torchqm that did not say so"
-                raise UserError(
-                    f"{folder}: has a run of {was} ({name}), this is {__version__}; its results would be mixed with "
-                    "others: take another folder, or delete this one"
-                )
-            if found.get("arguments") != list(run.arguments):
-                raise UserError(f"{folder}: has a run with other arguments ({name}); give another --out, or remove it")
-            return found if name == _RESULT and found["status"] == "done" else None  # what failed is tried again
-    raise UserError(f"{folder}: exists, but is no run of a sweep; give another --out, or remove it")
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_text())
-    except ValueError as error:
-        raise UserError(f"{path}: damaged ({error}); delete the folder to have the run made again") from error
-    if not isinstance(found, dict):
-        raise UserError(f"{path}: no result of a run; give another --out, or remove it")
-    return found
-
-
-def _write(path: Path, values: Mapping[str, Any]) -> None:
-    from torchqm.geometry.files import write_whole
-
-    text = json.dumps(values, indent=1) + "\n"
-    write_whole(path, lambda file: file.write(text.encode()))

@@ -6,15 +6,8 @@ from torchqm.data.dataset import PairDataset, ShapeDataset
 from torchqm.data.items import ItemOptions, make_item
 from torchqm.data.layouts import LAYOUTS, open_shapes
 from torchqm.data.pairs import choose_pairs
-from torchqm.data.published import (
-    PUBLISHED_METHODS,
-    PublishedResult,
-    PublishedSummary,
-    load_published,
-    published_summary,
-    read_published,
-    summarize_published,
-)
+from torchqm.data.published import PUBLISHED_METHODS, PublishedResult, load_published, read_published
+from torchqm.data.published_means import PublishedSummary, published_summary, summarize_published
 from torchqm.data.scb import SCBenchmark, SymmetryLandmarks, shape_class
 from torchqm.data.splits import Split, SplitError, draw_split, own_split, read_split_file, write_split_file
 from torchqm.data.synthetic import CREATURES, Creature, ExactMaps, creature, exact_maps, symmetry_truth

@@ -185,20 +185,16 @@ class SyntheticShapes(ShapeSet):
         Raises:
             TruthError: they are different bodies.
         """
-        if self.shape_class(first) != self.shape_class(second):
-            raise TruthError(
-                f"{self.root}: no truth from {first} to {second}: bodies {self.shape_class(first)} and "
-                f"{self.shape_class(second)} differ"
-            )
+        self._require_one_body(first, second)
         return exact_maps(self.creature(first), self.creature(second))
 
     def truth(self, first: str, second: str) -> Truth:
         """The direct map at every vertex of ``first``: vertex ids where triangles are shared, else points in faces."""
-        maps = self.exact(first, second)
+        self._require_one_body(first, second)
         if first == second or self.options.triangulation == "shared":
-            source = f"vertex ids agree on the body {self.shape_class(first)}"
-            return Truth(torch.arange(maps.faces.shape[1]), maps.nearest_vertices()[0], source)
-        return _element(maps, 0, f"exact places on the body {self.shape_class(first)}")
+            ids = torch.arange(self.mesh(first).n_verts)
+            return Truth(ids, ids, f"vertex ids agree on the body {self.shape_class(first)}")
+        return _element(self.exact(first, second), 0, f"exact places on the body {self.shape_class(first)}")
 
     def mirrored_truth(self, first: str, second: str) -> Truth | None:
         """Where a map that is flipped as a whole sends the vertices; None unless there is exactly one reflection."""
@@ -230,6 +226,13 @@ class SyntheticShapes(ShapeSet):
     def problems(self) -> list[Problem]:
         """None: there are no files."""
         return []
+
+    def _require_one_body(self, first: str, second: str) -> None:
+        if self.shape_class(first) != self.shape_class(second):
+            raise TruthError(
+                f"{self.root}: no truth from {first} to {second}: bodies {self.shape_class(first)} and "
+                f"{self.shape_class(second)} differ"
+            )
 
     def _place(self, name: str) -> _Place:
         self.require(name)

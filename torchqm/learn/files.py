@@ -1,29 +1,22 @@
-"""Trained networks in files: safetensors with the options as JSON in the metadata, and Lightning's checkpoints."""
+"""Trained networks in files: safetensors with the options as JSON in the metadata; checkpoints are read, too."""
 
 import hashlib
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
-from zipfile import BadZipFile, ZipFile, is_zipfile
 
 import torch
 from torch import Tensor
 
 from torchqm.geometry.files import write_whole
+from torchqm.learn.checkpoints import SUFFIX, find_weights, read_checkpoint, require_finite
 from torchqm.learn.net import MatchNet
 from torchqm.learn.options import NetOptions
 from torchqm.version import __version__
 
-__all__ = ["BUILTIN", "SUFFIX", "differences", "digest", "find_weights", "load_net", "read_checkpoint", "save_net"]
-
-BUILTIN = "builtin"
-"""Names the network that ships with torchqm."""
-
-SUFFIX = ".safetensors"
+__all__ = ["differences", "digest", "load_net", "save_net"]
 
 FORMAT = 1
 _KEY = "torchqm"  # one entry of metadata: the order of several would differ from file to file
@@ -97,86 +90,6 @@ def load_net(path: str | Path) -> MatchNet:
     return net.eval()
 
 
-def find_weights(path: str | Path) -> Path:
-    """The file that :func:`load_net` reads: the path itself, the best checkpoint of a run folder, or its last.
-
-    Raises:
-        ValueError: there is nothing, or no checkpoint in the folder.
-    """
-    if str(path) == BUILTIN:
-        return Path(__file__).with_name(f"builtin{SUFFIX}")
-    if "://" in str(path):
-        raise ValueError(f"{path}: a URL; a trained network is read from a file on this machine")
-    path = Path(path)
-    if path.is_dir():
-        folder = path / "checkpoints" if (path / "checkpoints").is_dir() else path
-        if (best := _best_of(folder)) is not None:
-            return best
-        for pattern in ("best*.ckpt", "last*.ckpt", "*.ckpt"):
-            found = sorted(folder.glob(pattern), key=_natural)
-            if found:
-                return found[-1]
-        raise ValueError(f"{path}: no checkpoint in {folder}; a folder of a training run has *.ckpt there")
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file or run folder; '{BUILTIN}' names the network that ships with torchqm")
-    if path.suffix not in (SUFFIX, ".ckpt"):
-        raise ValueError(f"{path}: a trained network is a {SUFFIX} or a .ckpt file, or the folder of a run")
-    return path
-
-
-def _best_of(folder: Path) -> Path | None:
-    """The checkpoint that the last one remembers as the best; None if it does not, or it is not there any more."""
-    for last in sorted(folder.glob("last*.ckpt"), key=_natural)[::-1]:
-        try:
-            callbacks = read_checkpoint(last).get("callbacks", {})
-        except ValueError:  # to be told when it is used
-            continue
-        states = callbacks.values() if isinstance(callbacks, dict) else []
-        names = [state.get("best_model_path") for state in states if isinstance(state, dict)]
-        there = [folder / Path(str(name)).name for name in names if name]
-        if found := [path for path in there if path.is_file()]:
-            return found[0]
-    return None
-
-
-def read_checkpoint(path: Path) -> dict[str, Any]:
-    """What a Lightning checkpoint of a :class:`torchqm.learn.MatchModule` holds; nothing in it is ever executed.
-
-    Raises:
-        ValueError: it is damaged, or something else; the file is named.
-    """
-    try:
-        if is_zipfile(path):  # torch does not look at the sums that it wrote
-            with ZipFile(path) as archive:
-                damaged = archive.testzip()
-            if damaged is not None:
-                raise ValueError(f"{damaged} in it is not what was written")
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except UnpicklingError as error:
-        # Of a pickle with other objects, and of what is no pickle at all. What torch says is how to execute it.
-        found = re.search(r"(?:GLOBAL|global) (\w+(?:\.\w+)+)", str(error))
-        what = f" ({found[1]})" if found else ""
-        raise ValueError(f"{path}: damaged, or holds more than weights{what} and is not read") from error
-    except (OSError, RuntimeError, EOFError, KeyError, ValueError, BadZipFile) as error:
-        raise ValueError(f"{path}: damaged, cut short or no checkpoint ({_short(error)})") from error
-    needed = ("state_dict", "hyper_parameters")
-    if not isinstance(content, dict) or any(not isinstance(content.get(name), dict) for name in needed):
-        raise ValueError(f"{path}: no checkpoint of torchqm.learn.MatchModule ({' and '.join(needed)} are needed)")
-    if not {field.name for field in fields(NetOptions)} & set(content["hyper_parameters"]):
-        raise ValueError(
-            f"{path}: no checkpoint of torchqm.learn.MatchModule: its hyperparameters are those of another"
-        )
-    _require_finite(path, content["state_dict"])
-    return content
-
-
-def _require_finite(path: Path, state: Mapping[str, Any]) -> None:
-    bad = [name for name, v in state.items() if isinstance(v, Tensor) and not bool(torch.isfinite(v).all())]
-    if bad:
-        more = f" and {len(bad) - 3} more" if len(bad) > 3 else ""
-        raise ValueError(f"{path}: weights that are NaN or infinite: {', '.join(bad[:3])}{more}")
-
-
 def differences(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor], shown: int = 4) -> str:
     """How the names and shapes of some weights differ from others, in words; empty if they do not.
 
@@ -227,7 +140,7 @@ def _read(path: Path) -> _Read:
             raise ValueError(f"{path}: of format {about['format']!r}; this version of torchqm reads {FORMAT}")
     except (json.JSONDecodeError, TypeError, KeyError) as error:
         raise ValueError(f"{path}: safetensors, but no network of torchqm: its metadata has no options") from error
-    _require_finite(path, state)
+    require_finite(path, state)
     return options, state, about.get("digest")
 
 
@@ -237,12 +150,3 @@ def _read_checkpoint(path: Path) -> _Read:
     options = {name: value for name, value in content["hyper_parameters"].items() if name in names}
     state = {name: value for name, value in content["state_dict"].items() if name.startswith(_PREFIX)}
     return options, {name.removeprefix(_PREFIX): value for name, value in state.items()}, None
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """``epoch=10`` comes after ``epoch=9``."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.stem)]
-
-
-def _short(error: Exception) -> str:
-    return (str(error) or type(error).__name__).strip().splitlines()[0][:200]

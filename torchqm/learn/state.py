@@ -7,7 +7,8 @@ from typing import Any
 
 from torch import Tensor
 
-from torchqm.learn.files import SUFFIX, differences, read_checkpoint
+from torchqm.learn.checkpoints import SUFFIX, read_checkpoint
+from torchqm.learn.files import differences
 from torchqm.learn.options import other_architecture
 
 __all__ = ["TrainingState", "check_state"]

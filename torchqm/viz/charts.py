@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 from torchqm.geometry.files import write_whole
 
-__all__ = ["bar_figure", "cumulative_curve", "error_curves", "line_figure", "new_figure", "save_figure"]
+__all__ = ["bar_figure", "curve_points", "error_curves", "line_figure", "new_figure", "save_figure"]
 
 # Okabe and Ito's colours, told apart by colour-blind readers; their yellow is left out, it does not show on white
 CYCLE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
@@ -70,7 +70,7 @@ def save_figure(figure: "matplotlib.figure.Figure", path: str | Path) -> Path:
     return path
 
 
-def cumulative_curve(
+def curve_points(
     errors: Shaped[Tensor, "..."] | Shaped[np.ndarray, "..."] | Sequence[float], xlim: float | int = 0.25
 ) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
     """The field's error curve ``y(x) = |{i : e_i <= x}| / n`` at 501 evenly spaced x.
@@ -86,7 +86,7 @@ def cumulative_curve(
         ValueError: if ``errors`` is not a non-empty row of finite numbers of at least 0.
 
     Example:
-        >>> x, y = cumulative_curve([0.0, 0.1, 0.3], xlim=0.2)
+        >>> x, y = curve_points([0.0, 0.1, 0.3], xlim=0.2)
         >>> [round(float(y[i]), 3) for i in (0, 249, 250, 500)]
         [0.333, 0.333, 0.667, 0.667]
     """
@@ -132,7 +132,7 @@ def error_curves(
     ax = _axes(figure, xlabel, "share of correspondences", title)
     for i, (name, errors) in enumerate(curves.items()):
         try:
-            x, y = cumulative_curve(errors, xlim)
+            x, y = curve_points(errors, xlim)
         except ValueError as error:
             raise ValueError(f"curves[{name!r}]: {error}") from error
         ax.plot(x, y, label=f"{name} (mean {_numpy(errors).mean():.4f})", **_look(i))

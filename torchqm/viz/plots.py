@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchqm.geometry.mesh import Mesh
 from torchqm.viz.camera import FRONT, View, auto_frame, project, up_scores
-from torchqm.viz.charts import bar_figure, cumulative_curve, error_curves, line_figure, new_figure, save_figure
+from torchqm.viz.charts import bar_figure, curve_points, error_curves, line_figure, new_figure, save_figure
 from torchqm.viz.render import render_mesh, to_rgb, xyz_colors
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "bar_figure",
-    "cumulative_curve",
+    "curve_points",
     "error_curves",
     "line_figure",
     "match_figure",
