@@ -55,9 +55,9 @@ class SurfaceSearch:
             n: anchors near a vertex whose partners are tried for it.
         """
         everything, chosen = verts.numpy(), verts[anchors].numpy()
-        tree, workers = scipy.spatial.cKDTree, torch.get_num_threads()
-        around = tree(everything).query(chosen, k=min(m, len(everything)), workers=workers)[1]
-        close = tree(chosen).query(everything, k=min(n, len(chosen)), workers=workers)[1]
+        tree, threads = scipy.spatial.cKDTree, torch.get_num_threads()
+        around = tree(everything).query(chosen, k=min(m, len(everything)), workers=max(threads, workers()))[1]
+        close = tree(chosen).query(everything, k=min(n, len(chosen)), workers=max(threads, workers()))[1]
         return cls(
             anchors,
             torch.from_numpy(around.reshape(len(chosen), -1)),
@@ -167,4 +167,8 @@ def _closest(queries: np.ndarray, points: np.ndarray, candidates: np.ndarray) ->
 
 
 def _float32(values: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    return np.subtract(values, centre, out=np.empty(values.shape, dtype=np.float32), casting="same_kind")
+    out = np.empty(values.shape, dtype=np.float32)
+    size = max(1, -(-len(values) // workers()))
+    some = [slice(i, i + size) for i in range(0, len(values), size)]
+    in_parallel([partial(np.subtract, values[rows], centre, out=out[rows], casting="same_kind") for rows in some])
+    return out
