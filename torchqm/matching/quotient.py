@@ -1,7 +1,6 @@
 """Quotient-space matching of two shapes with known symmetry (paper, section 4, Algorithm 1)."""
 
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from jaxtyping import Float, Int
@@ -9,14 +8,13 @@ from torch import Tensor
 
 from torchqm.fmap.convert import deltas, fmap_to_p2p, nearest_used
 from torchqm.fmap.refine import correspondence_fmap, growing_sizes, quotient_icp, upsample
-from torchqm.fmap.threads import in_parallel
 from torchqm.fmap.two_way import Places, two_way_upsample
 from torchqm.matching.described import pair_descriptors
-from torchqm.matching.initial import basis_size, curvature_descriptors, fmap_from_coefficients
+from torchqm.matching.initial import basis_size, curvature_descriptors, fmap_from_coefficients, split_bases
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.features import local_features
-from torchqm.symmetry.basis import EvenOddBasis, symmetrized_basis
+from torchqm.symmetry.basis import EvenOddBasis
 from torchqm.symmetry.group import SymmetryGroup
 
 __all__ = [
@@ -91,8 +89,7 @@ def match_quotient(
         Paper, section 4.3 and 4.4.
     """
     k = basis_size([x.basis, y.basis], parameters.k if k is None else k)
-    bases = ((x.basis.truncate(k), group_x), (y.basis.truncate(k), group_y))
-    source, target = in_parallel([partial(symmetrized_basis, basis, group) for basis, group in bases])
+    source, target = split_bases(x, y, k, group_x, group_y)
     if values is None:
         described = pair_descriptors(x, y, parameters, k).coefficients
     else:
