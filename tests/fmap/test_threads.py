@@ -103,6 +103,23 @@ def test_a_thread_that_is_done_helps_with_the_task_that_is_left():
         assert sorted(found[tasks.index(long)]) == [0, 1]
 
 
+def test_tasks_that_nobody_had_time_for_are_taken_when_somebody_has():
+    """The parts are handed out while the other thread is busy, and wait for each other."""
+    met, begun, may_end = Barrier(2, timeout=20), Event(), Event()
+
+    def other():
+        begun.set()
+        assert may_end.wait(20)
+
+    def parts():
+        assert begun.wait(20)
+        assert workers() == 1
+        return in_parallel([lambda: may_end.set() or met.wait(), met.wait])
+
+    with one_thread():
+        assert sorted(in_parallel([parts, other])[0]) == [0, 1]
+
+
 def test_never_more_threads_than_there_were():
     running, most, lock = [0], [0], Lock()
 

@@ -142,7 +142,7 @@ def in_parallel(tasks: Sequence[Callable[[], Result]]) -> list[Result]:
         [1, 2]
     """
     team = _TEAM.get()
-    if team is None or len(tasks) < 2 or not team.idle:
+    if team is None or team.size < 2 or len(tasks) < 2:
         return [task() for task in tasks]
     return team.run(tasks)
 
