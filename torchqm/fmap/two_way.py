@@ -117,7 +117,13 @@ def _correspondence(
     images = torch.cat([here.evecs[:n, :k_here] @ fmap.T, scale * here.places.features[:n]], 1)
     points = torch.cat([there.evecs[:, :k_there], scale * there.places.features], 1)
     partners = nearest_rows(images, points, exact=False)
-    return there.evecs[partners, : size[0]].T @ here.evecs[:n, : size[1]] / n
+    halves = zip(partners.chunk(2), here.evecs[:n].chunk(2), strict=True)
+    products = [partial(_product, there.evecs, ids, rows, size) for ids, rows in halves]
+    return torch.stack(in_parallel(products)).sum(0) / n
+
+
+def _product(evecs: Tensor, ids: Tensor, rows: Tensor, size: tuple[int, int]) -> Tensor:
+    return evecs[ids, : size[0]].T @ rows[:, : size[1]]
 
 
 def growing_pairs(start: tuple[int, int], stop: tuple[int, int], ratio: float = 1.2) -> list[tuple[int, int]]:
