@@ -55,9 +55,8 @@ class SurfaceSearch:
             n: anchors near a vertex whose partners are tried for it.
         """
         everything, chosen = verts.numpy(), verts[anchors].numpy()
-        tree, threads = scipy.spatial.cKDTree, torch.get_num_threads()
-        around = tree(everything).query(chosen, k=min(m, len(everything)), workers=max(threads, workers()))[1]
-        close = tree(chosen).query(everything, k=min(n, len(chosen)), workers=max(threads, workers()))[1]
+        around = _closest_in_space(everything, chosen, min(m, len(everything)))
+        close = _closest_in_space(chosen, everything, min(n, len(chosen)))
         return cls(
             anchors,
             torch.from_numpy(around.reshape(len(chosen), -1)),
@@ -103,6 +102,14 @@ class SurfaceSearch:
             unsure, place = np.unique(rows, return_inverse=True)
             found[unsure] = settled(given[unsure], everything, place, columns)
         return torch.from_numpy(found)
+
+
+def _closest_in_space(points: np.ndarray, queries: np.ndarray, k: int) -> np.ndarray:
+    """``(Q, k)`` the nearest points of each query; a k-d tree gives them without the last dimension for k = 1."""
+    tree, size = scipy.spatial.cKDTree(points), max(1, -(-len(queries) // workers()))
+    parts = [queries[i : i + size] for i in range(0, len(queries), size)]
+    found = in_parallel([partial(tree.query, part, k, workers=torch.get_num_threads()) for part in parts])
+    return np.concatenate([ids for _, ids in found])
 
 
 def _around(

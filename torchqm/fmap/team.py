@@ -48,17 +48,10 @@ class Team:
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self._busy = 1
         self._closed = False
         self._jobs: list[_Job] = []
         self._helpers: list[Thread] = []
         self._changed = Condition()
-
-    @property
-    def idle(self) -> int:
-        """How many threads have nothing to do just now, and no task that waits for them."""
-        with self._changed:
-            return max(0, self.size - self._busy - sum(len(job.waiting) for job in self._jobs))
 
     def run(self, tasks: Sequence[Callable[[], Any]]) -> list[Any]:
         """The results of some tasks, in order. They are begun in order, none after an error; the first one is raised.
@@ -72,11 +65,9 @@ class Team:
                 self._helpers.append(Thread(target=self._help))
                 self._helpers[-1].start()
             self._changed.notify_all()
-            self._busy -= 1
             try:
                 self._serve(job)
             finally:
-                self._busy += 1
                 self._jobs.remove(job)
         if job.errors:
             raise job.errors[min(job.errors)]
@@ -103,13 +94,11 @@ class Team:
                 self._changed.wait()
                 continue
             number = job.waiting.popleft()
-            self._busy += 1
             self._changed.release()
             try:
                 job.run(number)
             finally:
                 self._changed.acquire()
-                self._busy -= 1
             job.left -= 1
             if job.errors:
                 job.left -= len(job.waiting)

@@ -121,13 +121,12 @@ def threads_as_before() -> Iterator[None]:
 
 
 def workers() -> int:
-    """How many tasks could run at the same time here; 1 outside :func:`one_thread`, where the libraries have threads.
+    """How many tasks may run at the same time here; 1 outside :func:`one_thread`, where the libraries have threads.
 
-    In a task that is one more than there are threads with nothing to do just now: what is left of uneven tasks shares
-    its own parts with those that are done. So no result may depend on this number.
+    Tasks divide their own work by it, too: parts that nobody has time for just now are there for threads that are done.
     """
     team = _TEAM.get()
-    return 1 if team is None else 1 + team.idle
+    return 1 if team is None else team.size
 
 
 def in_parallel(tasks: Sequence[Callable[[], Result]]) -> list[Result]:
