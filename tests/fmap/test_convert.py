@@ -5,7 +5,9 @@ import torch
 from references.shapes import basis_of, renumbered
 from references.unchecked import unchecked
 
+import torchqm.fmap.convert as convert
 from torchqm.fmap import deltas, fmap_to_p2p, nearest_used, p2p_to_fmap
+from torchqm.fmap.threads import one_thread
 from torchqm.geometry import Mesh
 from torchqm.spectral import mesh_basis
 from torchqm.symmetry import symmetrized_basis
@@ -83,3 +85,21 @@ def test_wrong_length(pair):
     x, copy = pair
     with pytest.raises(ValueError, match="p2p_yx has 7 entries, but y has 642 vertices"):
         unchecked(p2p_to_fmap)(copy.p2p_yx[:7], x, copy.basis)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_blocks_of_vertices_give_the_pull_back(pair, threads, monkeypatch):
+    """By blocks of 100 of the 642 vertices, the same to the last bit on any number of threads."""
+    x, other = pair
+    y, p2p = other.basis, other.p2p_yx
+    wanted = y.coefficients(x.evecs[p2p])
+    monkeypatch.setattr(convert, "_ROWS", 100)
+    alone, before = p2p_to_fmap(p2p, x, y), torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        with one_thread():
+            found = p2p_to_fmap(p2p, x, y)
+    finally:
+        torch.set_num_threads(before)
+    torch.testing.assert_close(found, wanted, atol=1e-13, rtol=0)
+    assert torch.equal(found, alone)

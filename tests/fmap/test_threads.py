@@ -1,7 +1,7 @@
 """torchqm.fmap.threads: one thread inside, what was set before outside, also after an error."""
 
 from functools import partial
-from threading import Barrier, Event, Thread, get_ident
+from threading import Barrier, Event, Lock, Thread, active_count, get_ident
 from time import sleep
 
 import pytest
@@ -71,13 +71,108 @@ def test_tasks_run_at_the_same_time_in_order():
         return number, workers(), torch.get_num_threads()
 
     with one_thread():
-        assert in_parallel([partial(task, 0), partial(task, 1)]) == [(0, 1, 1), (1, 1, 1)]
+        assert in_parallel([partial(task, 0), partial(task, 1)]) == [(0, 2, 1), (1, 2, 1)]
         assert in_parallel([]) == []
-        assert in_parallel([workers]) == [2]  # a single task keeps them all
+        assert in_parallel([workers]) == [2]
 
 
 def test_without_workers_one_after_the_other_in_this_thread():
     assert in_parallel([get_ident, get_ident]) == [get_ident()] * 2
+
+
+def test_a_thread_that_is_done_helps_with_the_task_that_is_left():
+    """The parts of the long task wait for each other: with one thread left to it they would never end."""
+    met, done = Barrier(2, timeout=20), Event()
+
+    def short():
+        done.set()
+        return get_ident()
+
+    def long():
+        assert done.wait(20)
+        return in_parallel([met.wait, met.wait])
+
+    for tasks in ([short, long], [long, short]):
+        done.clear()
+        with one_thread():
+            found = in_parallel(tasks)
+        assert sorted(found[tasks.index(long)]) == [0, 1]
+
+
+def test_tasks_that_nobody_had_time_for_are_taken_when_somebody_has():
+    """The parts are handed out while the other thread is busy, and wait for each other."""
+    met, begun, may_end = Barrier(2, timeout=20), Event(), Event()
+
+    def other():
+        begun.set()
+        assert may_end.wait(20)
+
+    def parts():
+        assert begun.wait(20)
+        return in_parallel([lambda: may_end.set() or met.wait(), met.wait])
+
+    with one_thread():
+        assert sorted(in_parallel([parts, other])[0]) == [0, 1]
+
+
+def test_never_more_threads_than_there_were():
+    running, most, lock = [0], [0], Lock()
+
+    def leaf(number):
+        with lock:
+            running[0] += 1
+            most[0] = max(most[0], running[0])
+        sleep(0.002)
+        with lock:
+            running[0] -= 1
+        return number
+
+    def branch(number):
+        return in_parallel([partial(leaf, 4 * number + i) for i in range(4)])
+
+    torch.set_num_threads(3)
+    with one_thread():
+        found = in_parallel([partial(branch, number) for number in range(5)])
+    assert [number for part in found for number in part] == list(range(20))
+    assert most[0] == 3
+    assert running[0] == 0
+
+
+def test_helpers_have_the_gradient_mode_of_the_caller():
+    met, weight = Barrier(2, timeout=20), torch.ones(2, requires_grad=True)
+
+    def task():
+        met.wait()
+        return (2 * weight).requires_grad, torch.is_inference_mode_enabled()
+
+    with one_thread():
+        assert in_parallel([task, task]) == [(True, False)] * 2
+        with torch.no_grad():
+            assert in_parallel([task, task]) == [(False, False)] * 2
+        with torch.inference_mode():
+            assert in_parallel([task, task]) == [(False, True)] * 2
+
+
+def test_helpers_end_with_the_region():
+    before = active_count()
+    with one_thread():
+        in_parallel([get_ident] * 4)
+        assert active_count() == before + 1
+    assert active_count() == before
+
+
+def test_of_several_errors_the_first_and_nothing_is_begun_after_it():
+    met, begun = Barrier(2, timeout=20), []
+
+    def fail(number):
+        begun.append(number)
+        if number < 2:
+            met.wait()  # both are running when the first error comes
+        raise KeyError(f"task {number}")
+
+    with one_thread(), pytest.raises(KeyError, match="task 0"):
+        in_parallel([partial(fail, number) for number in range(50)])
+    assert len(begun) <= 3  # the third where one of the two was quick
 
 
 def test_an_error_of_a_task_comes_out():

@@ -11,6 +11,7 @@ from references.pairs import K, exact_pair
 from references.unchecked import unchecked
 
 from torchqm.fmap import Places, growing_pairs, nearest_isometry, p2p_to_fmap, two_way_upsample
+from torchqm.fmap.threads import one_thread
 from torchqm.spectral import SpectralBasis
 
 
@@ -128,3 +129,17 @@ def test_bad_input_is_named(pair):
         two_way_upsample(start, pair.x.basis, pair.y.basis, places(n), places(n), [(20, 20)], -1.0)
     with pytest.raises(ValueError, match=rf"sizes \({K + 1}, 20\)"):
         two_way_upsample(start, pair.x.basis, pair.y.basis, places(n), places(n), [(K + 1, 20)])
+
+
+def test_both_ways_at_once_change_nothing(pair):
+    found, before = [], torch.get_num_threads()
+    on_x, on_y = places(pair.x.n_verts, noise(pair.x.n_verts, 3)), places(pair.x.n_verts, noise(pair.x.n_verts, 3))
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        try:
+            with one_thread():
+                start = nearest_isometry(noise(20, 20))
+                found.append(two_way_upsample(start, pair.x.basis, pair.y.basis, on_x, on_y, [(25, 25), (K, K)]))
+        finally:
+            torch.set_num_threads(before)
+    assert torch.equal(*found)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 
-from torchqm.geometry import Mesh, cotan_stiffness, laplacian, lumped_mass, robust_stiffness, to_scipy
+from torchqm.geometry import Mesh, cotan_matrix, cotan_stiffness, laplacian, lumped_mass, robust_stiffness, to_scipy
 
 GRID = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]
 TWO = [[0, 1, 2], [1, 3, 2]]
@@ -203,3 +203,14 @@ def test_energy_never_grows_negative_on_bad_triangles(seed):
     faces = torch.stack([torch.randperm(12, generator=generator)[:3] for _ in range(20)])
     values = torch.linalg.eigvalsh(cotan_stiffness(verts, faces).to_dense())
     assert values[0] > -1e-9 * values[-1]
+
+
+@pytest.mark.parametrize("faces", [TWO, [*TWO, [0, 0, 3], [0, 1, 2]], [[0, 1, 2]]])
+def test_the_matrix_for_scipy_is_the_same(faces):
+    """Also with a corner twice, a triangle twice, and a vertex without triangles."""
+    verts, faces = torch.tensor(GRID, dtype=torch.float64) + 0.3 * planar(2)[0].verts, torch.tensor(faces)
+    found = torch.from_numpy(cotan_matrix(verts, faces).toarray())
+    torch.testing.assert_close(found, cotan_stiffness(verts, faces).to_dense(), atol=1e-14, rtol=0)
+    ball = sphere()
+    slow = to_scipy(cotan_stiffness(ball.verts, ball.faces))
+    assert abs(cotan_matrix(ball.verts, ball.faces) - slow).max() < 1e-13

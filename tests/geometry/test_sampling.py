@@ -197,3 +197,10 @@ def test_duplicate_positions_are_taken_once_each():
 def test_bad_arguments(call, fault):
     with pytest.raises(ValueError, match=fault):
         call(uneven())
+
+
+def test_a_first_part_is_the_smaller_sample():
+    """Mirror planes draw once for samples of three sizes."""
+    mesh = sphere()
+    for n in (1, 7, 100):
+        assert torch.equal(area_samples(mesh, 130, 5)[:n], area_samples(mesh, n, 5))

@@ -5,6 +5,7 @@ import torch
 from references.pairs import FAST, exact_pair, with_loose_vertices
 from references.shapes import blob
 
+from torchqm.fmap.threads import one_thread
 from torchqm.matching import described, prepare
 from torchqm.matching.described import pair_descriptors
 from torchqm.matching.initial import shared_descriptors
@@ -66,3 +67,24 @@ def test_kept_no_longer_than_the_shapes():
     del y
     gc.collect()
     assert len(described._KEPT[x]) == before - 1
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_blocks_of_weighted_vertices_with_and_without_area(threads, monkeypatch):
+    """By blocks of 100 vertices, the same to the last bit on any number of threads."""
+    loose, _ = with_loose_vertices(blob(2).mesh, [5, 600])
+    x = prepare(loose, 20)
+    parameters = FAST.changed(k=8)
+    found = pair_descriptors(x, x, parameters)
+    sign = torch.sign(x.mesh.verts[:, 0])
+    values = shared_descriptors([x.basis, x.basis], parameters)[0]
+    wanted = x.basis.truncate(8).coefficients(sign[:, None] * values)
+    monkeypatch.setattr(described, "_ROWS", 100)
+    alone, before = found.weighted(x, 8, sign), torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        with one_thread():
+            assert torch.equal(found.weighted(x, 8, sign), alone)
+    finally:
+        torch.set_num_threads(before)
+    torch.testing.assert_close(alone, wanted, atol=1e-10, rtol=1e-10)

@@ -6,7 +6,7 @@ from references.shapes import basis_of, blob, prism
 
 from torchqm.fmap import p2p_to_fmap, solve_fmap
 from torchqm.matching import MatchParameters, prepare
-from torchqm.matching.initial import basis_size, initial_fmap, shared_descriptors, unit_columns_pair
+from torchqm.matching.initial import basis_size, initial_fmap, shared_descriptors, split_bases, unit_columns_pair
 from torchqm.spectral import heat_times, wave_energies
 from torchqm.symmetry import symmetrized_basis
 
@@ -99,3 +99,13 @@ def test_no_cluster_is_cut():
         assert size == k or same[k - 2]
         assert basis_size([simple], k) == k
     assert basis_size([simple, paired.truncate(10)], 25) == 10
+
+
+def test_split_bases_are_those_of_each_shape():
+    pair = exact_pair()
+    group_y = pair.group_y
+    found = split_bases(pair.x, pair.y, 12, pair.group_x, group_y)
+    for split, shape, group in zip(found, (pair.x, pair.y), (pair.group_x, group_y), strict=True):
+        wanted = symmetrized_basis(shape.basis.truncate(12), group)
+        assert torch.equal(split.even_coeffs, wanted.even_coeffs)
+        assert torch.equal(split.odd.evecs, wanted.odd.evecs)

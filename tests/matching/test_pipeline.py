@@ -9,6 +9,7 @@ import json
 import weakref
 from collections import Counter
 from dataclasses import replace
+from threading import Barrier
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ import torchqm.matching.collection as module
 import torchqm.matching.prepared as prepared
 from torchqm.data.synthetic import creature, exact_maps, symmetry_truth
 from torchqm.fmap import fmap_to_p2p
-from torchqm.geometry import Mesh, MeshError, save_mesh
+from torchqm.geometry import Mesh, MeshError, load_mesh, save_mesh
 from torchqm.matching import (
     Collection,
     MatchParameters,
@@ -577,6 +578,34 @@ def test_a_file_is_read_and_prepared_once(tmp_path):
     save_mesh(creature("quadruped", 600).mesh, path)
     collection = Collection(path, parameters=MatchParameters(k=20, k_max=30))
     assert collection.shape(str(path)) is collection.shape(path)
+
+
+def test_two_files_are_read_at_the_same_time(tmp_path, monkeypatch):
+    """Each waits for the other: one after the other they would never end. A file that is both is read once."""
+    paths, met, read = [tmp_path / "a.off", tmp_path / "b.off"], Barrier(2, timeout=20), []
+    for path, n in zip(paths, (600, 700), strict=True):
+        save_mesh(creature("quadruped", n).mesh, path)
+
+    def load(path):
+        read.append(path)
+        met.wait()
+        return load_mesh(path)
+
+    monkeypatch.setattr(module, "load_mesh", load)
+    collection, before = Collection(parameters=FAST), torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        result = collection.match(paths[0], str(paths[1]), "none")
+        assert sorted(map(str, read)) == sorted(map(str, paths))
+        collection.match(*paths, "none")
+        monkeypatch.setattr(module, "load_mesh", lambda path: read.append(path) or load_mesh(path))
+        Collection(parameters=FAST).match(paths[0], str(paths[0]), "none")
+    finally:
+        torch.set_num_threads(before)
+    assert len(read) == 3
+    assert result.details["target"]["name"] == str(paths[1])
+    with pytest.raises(MeshError, match=r"nowhere1\.off"):
+        collection.match(tmp_path / "nowhere1.off", tmp_path / "nowhere2.off")
 
 
 @pytest.mark.parametrize("method", ["quotient", "paper"])

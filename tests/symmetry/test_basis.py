@@ -133,3 +133,10 @@ def test_lemma_3_2(order):
             atol=1e-8,
             rtol=0,
         )
+
+
+def test_functions_are_made_once():
+    split = symmetrized_basis(basis_of(blob(2).mesh, 12), blob(2).group)
+    assert split.even is split.even
+    assert split.odd is split.odd
+    assert (split.even.k, split.odd.k) == (split.even_coeffs.shape[1], split.odd_coeffs.shape[1])

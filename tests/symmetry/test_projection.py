@@ -5,7 +5,8 @@ import torch
 from references.dense import reynolds
 from references.shapes import basis_of
 
-from torchqm.symmetry import even_part, odd_part, projection_matrix
+import torchqm.symmetry.projection as projection
+from torchqm.symmetry import SymmetryGroup, even_part, odd_part, projection_matrix
 
 
 def noise(n, c=3):
@@ -52,3 +53,14 @@ def test_wrong_number_of_vertices(mirror_blob):
     for project in (even_part, odd_part):
         with pytest.raises(ValueError, match="values: 7 rows, but the group acts on 642 vertices"):
             project(noise(7), mirror_blob.group)
+
+
+def test_projection_matrix_is_that_of_the_mean_over_orbits(blob, monkeypatch):
+    """By blocks of 100 of the 642 vertices and at once."""
+    basis = basis_of(blob.mesh, 20)
+    wanted = basis.coefficients(even_part(basis.evecs, blob.group))
+    for rows in (100, 1000):
+        monkeypatch.setattr(projection, "_ROWS", rows)
+        torch.testing.assert_close(projection_matrix(basis, blob.group), wanted, atol=1e-13, rtol=0)
+    with pytest.raises(ValueError, match="values: 642 rows, but the group acts on 7 vertices"):
+        projection_matrix(basis, SymmetryGroup.trivial(7))

@@ -13,6 +13,8 @@ from torchqm.spectral.basis import SpectralBasis
 
 __all__ = ["deltas", "fmap_to_p2p", "nearest_used", "p2p_to_fmap"]
 
+_ROWS = 2048  # of a block of vertices
+
 
 def deltas(basis: SpectralBasis, time: float = 0.0) -> Float[Tensor, "V K"]:
     """Row x holds the coefficients of ``delta_{x,t}``, the heat that has spread from x for a time t.
@@ -64,16 +66,18 @@ def fmap_to_p2p(
     if fmap_xy.shape != (basis_y.k, basis_x.k):
         raise ValueError(f"fmap_xy: expected shape ({basis_y.k}, {basis_x.k}), got {tuple(fmap_xy.shape)}")
     if search is not None:  # in single precision, as the search itself
-        rows, single = deltas(basis_x, time), fmap_xy.T.float()
-        parts = rows.split(max(1, -(-len(rows) // workers())))
-        images = torch.cat(in_parallel([partial(_times, part, single) for part in parts]))
+        rows, single = deltas(basis_x, time).detach(), fmap_xy.detach().T.float()
+        images = torch.empty(len(rows), basis_y.k, dtype=torch.float32)
+        size = max(1, -(-len(rows) // workers()))
+        parts = zip(rows.split(size), images.split(size), strict=True)
+        in_parallel([partial(_times, part, single, out) for part, out in parts])
         return search.nearest(images, deltas(basis_y, time), guide)
     images = deltas(basis_x, time) @ fmap_xy.T
     return nearest_used(images, basis_y, time)
 
 
-def _times(rows: Tensor, single: Tensor) -> Tensor:
-    return rows.float() @ single
+def _times(rows: Tensor, single: Tensor, out: Tensor) -> None:
+    torch.mm(rows.float(), single, out=out)
 
 
 def nearest_used(
@@ -104,4 +108,11 @@ def p2p_to_fmap(p2p_yx: Int[Tensor, " Vy"], basis_x: SpectralBasis, basis_y: Spe
     """
     if p2p_yx.shape[0] != basis_y.n_verts:
         raise ValueError(f"p2p_yx has {p2p_yx.shape[0]} entries, but y has {basis_y.n_verts} vertices")
-    return basis_y.coefficients(basis_x.evecs[p2p_yx])
+    # By blocks, so that the functions pulled back never exist at all vertices.
+    parts = zip(basis_y.evecs.split(_ROWS), basis_y.mass.split(_ROWS), p2p_yx.split(_ROWS), strict=True)
+    blocks = [(SpectralBasis(basis_y.evals, evecs, mass), ids) for evecs, mass, ids in parts]
+    return torch.stack(in_parallel([partial(_pulled_back, basis_x, block, ids) for block, ids in blocks])).sum(0)
+
+
+def _pulled_back(basis_x: SpectralBasis, block: SpectralBasis, ids: Tensor) -> Tensor:
+    return block.coefficients(basis_x.evecs[ids])

@@ -171,13 +171,13 @@ def upsample(
         raise ValueError(f"steps={steps}: each size needs at least one iteration")
     if len(sizes) and max(sizes) > min(basis_x.k, basis_y.k):
         raise ValueError(f"sizes up to {max(sizes)}: the bases have {basis_x.k} and {basis_y.k} functions")
+    at_x = basis_x.evecs[samples]
     for size in sizes:
-        small_x, small_y = basis_x.truncate(size), basis_y.truncate(size)
-        sources = small_x.evecs[samples]
+        small_y = basis_y.truncate(size)
         for _ in range(steps):
             ky, kx = fmap_xy.shape
-            partners = nearest_used(basis_x.evecs[samples, :kx] @ fmap_xy.T, basis_y.truncate(ky), exact=False)
-            fmap_xy = project(small_y.evecs[partners].T @ sources)
+            partners = nearest_used(at_x[:, :kx] @ fmap_xy.T, basis_y.truncate(ky), exact=False)
+            fmap_xy = project(small_y.evecs[partners].T @ at_x[:, :size])
     return fmap_xy
 
 

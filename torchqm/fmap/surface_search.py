@@ -55,9 +55,8 @@ class SurfaceSearch:
             n: anchors near a vertex whose partners are tried for it.
         """
         everything, chosen = verts.numpy(), verts[anchors].numpy()
-        tree, workers = scipy.spatial.cKDTree, torch.get_num_threads()
-        around = tree(everything).query(chosen, k=min(m, len(everything)), workers=workers)[1]
-        close = tree(chosen).query(everything, k=min(n, len(chosen)), workers=workers)[1]
+        around = _closest_in_space(everything, chosen, min(m, len(everything)))
+        close = _closest_in_space(chosen, everything, min(n, len(chosen)))
         return cls(
             anchors,
             torch.from_numpy(around.reshape(len(chosen), -1)),
@@ -103,6 +102,14 @@ class SurfaceSearch:
             unsure, place = np.unique(rows, return_inverse=True)
             found[unsure] = settled(given[unsure], everything, place, columns)
         return torch.from_numpy(found)
+
+
+def _closest_in_space(points: np.ndarray, queries: np.ndarray, k: int) -> np.ndarray:
+    """``(Q, k)`` the nearest points of each query; a k-d tree gives them without the last dimension for k = 1."""
+    tree, size = scipy.spatial.cKDTree(points), max(1, -(-len(queries) // workers()))
+    parts = [queries[i : i + size] for i in range(0, len(queries), size)]
+    found = in_parallel([partial(tree.query, part, k, workers=torch.get_num_threads()) for part in parts])
+    return np.concatenate([ids for _, ids in found])
 
 
 def _around(
@@ -167,4 +174,8 @@ def _closest(queries: np.ndarray, points: np.ndarray, candidates: np.ndarray) ->
 
 
 def _float32(values: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    return np.subtract(values, centre, out=np.empty(values.shape, dtype=np.float32), casting="same_kind")
+    out = np.empty(values.shape, dtype=np.float32)
+    size = max(1, -(-len(values) // workers()))
+    some = [slice(i, i + size) for i in range(0, len(values), size)]
+    in_parallel([partial(np.subtract, values[rows], centre, out=out[rows], casting="same_kind") for rows in some])
+    return out

@@ -3,19 +3,21 @@
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from contextvars import ContextVar, copy_context
+from contextvars import ContextVar
 from threading import Lock
 from typing import Any, TypeVar
 
 import torch
 from threadpoolctl import OpenBLASController, ThreadpoolController
 
+from torchqm.fmap.team import Team
+
 __all__ = ["in_parallel", "in_shares", "one_thread", "threads_as_before", "workers"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_WORKERS: ContextVar[int] = ContextVar("workers", default=1)
+_TEAM: ContextVar[Team | None] = ContextVar("team", default=None)
 _BEFORE: ContextVar[int] = ContextVar("before", default=0)  # torch's threads outside; 0 where no thread was taken
 
 
@@ -79,14 +81,16 @@ def one_thread() -> Iterator[None]:
         yield
         return
     before = _BLAS.take()
-    tokens = _WORKERS.set(max(before, _WORKERS.get())), _BEFORE.set(before)
+    team = Team(before)
+    tokens = _TEAM.set(team), _BEFORE.set(before)
     torch.set_num_threads(1)
     try:
         yield
     finally:
+        team.close()
         _BLAS.give_back()
         torch.set_num_threads(before)
-        _WORKERS.reset(tokens[0])
+        _TEAM.reset(tokens[0])
         _BEFORE.reset(tokens[1])
 
 
@@ -104,7 +108,7 @@ def threads_as_before() -> Iterator[None]:
     if not before:
         yield
         return
-    tokens = _WORKERS.set(1), _BEFORE.set(0)
+    tokens = _TEAM.set(None), _BEFORE.set(0)
     _BLAS.give_back()
     torch.set_num_threads(before)
     try:
@@ -112,37 +116,34 @@ def threads_as_before() -> Iterator[None]:
     finally:
         _BLAS.take()
         torch.set_num_threads(1)
-        _WORKERS.reset(tokens[0])
+        _TEAM.reset(tokens[0])
         _BEFORE.reset(tokens[1])
 
 
 def workers() -> int:
-    """How many tasks may run at the same time here; 1 outside :func:`one_thread`, where the libraries have threads."""
-    return _WORKERS.get()
+    """How many tasks may run at the same time here; 1 outside :func:`one_thread`, where the libraries have threads.
+
+    Tasks divide their own work by it, too: parts that nobody has time for just now are there for threads that are done.
+    """
+    team = _TEAM.get()
+    return 1 if team is None else team.size
 
 
 def in_parallel(tasks: Sequence[Callable[[], Result]]) -> list[Result]:
-    """The results of some independent tasks, in order; as many run at a time as there are workers.
+    """The results of some independent tasks, in order; as many run at a time as there are :func:`workers`.
 
     Tasks should be long (milliseconds) and spend their time where Python's lock is free: products, searches, sorting.
-    Their results do not depend on the number of workers. Of several errors the first task's is raised.
+    Their results do not depend on the number of workers. They are begun in order, none after an error; of several
+    errors the first task's is raised.
 
     Example:
         >>> in_parallel([lambda: 1, lambda: 2])
         [1, 2]
     """
-    n = min(workers(), len(tasks))
-    if n <= 1:
+    team = _TEAM.get()
+    if team is None or team.size < 2 or len(tasks) < 2:
         return [task() for task in tasks]
-    share = max(1, workers() // n)
-
-    def run(task: Callable[[], Result]) -> Result:
-        _WORKERS.set(share)  # of this thread's own copy of the context
-        return task()
-
-    with ThreadPoolExecutor(n) as pool:
-        futures = [pool.submit(copy_context().run, run, task) for task in tasks]
-        return [future.result() for future in futures]
+    return team.run(tasks)
 
 
 def in_shares(run: Callable[[Sequence[Item]], None], items: Sequence[Item], n: int) -> None:

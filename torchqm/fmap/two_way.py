@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,6 +11,7 @@ from torch import Tensor
 
 from torchqm.fmap.nearest import nearest_rows
 from torchqm.fmap.refine import FMap, growing_sizes, nearest_isometry
+from torchqm.fmap.threads import in_parallel
 from torchqm.spectral.basis import SpectralBasis
 
 __all__ = ["Places", "growing_pairs", "two_way_upsample"]
@@ -88,19 +91,39 @@ def two_way_upsample(
     for size_y, size_x in sizes:
         if size_y > basis_y.k or size_x > basis_x.k:
             raise ValueError(f"sizes ({size_y}, {size_x}): the bases have {basis_y.k} and {basis_x.k} functions")
-    at_x, at_y = basis_x.evecs[places_x.ids], basis_y.evecs[places_y.ids]
-    n_x, n_y = places_x.n_queries, places_y.n_queries
+    x, y = (_Side(basis.evecs[p.ids], p) for basis, p in ((basis_x, places_x), (basis_y, places_y)))
     for size_y, size_x in sizes:
-        k_y, k_x = fmap_xy.shape
-        look_x, look_y = (weight * k_y**0.5 * p.features for p in (places_x, places_y))
-        points_x, points_y = torch.cat([at_x[:, :k_x], look_x], 1), torch.cat([at_y[:, :k_y], look_y], 1)
-        on_y = nearest_rows(torch.cat([at_x[:n_x, :k_x] @ fmap_xy.T, look_x[:n_x]], 1), points_y, exact=False)
-        found = at_y[on_y, :size_y].T @ at_x[:n_x, :size_x] / n_x
+        scale = weight * fmap_xy.shape[0] ** 0.5
+        ways = [partial(_correspondence, x, y, fmap_xy, (size_y, size_x), scale)]
         if back:
-            on_x = nearest_rows(torch.cat([at_y[:n_y, :k_y] @ fmap_xy, look_y[:n_y]], 1), points_x, exact=False)
-            found = found + at_y[:n_y, :size_y].T @ at_x[on_x, :size_x] / n_y
-        fmap_xy = project(found)
+            ways.append(partial(_correspondence, y, x, fmap_xy.T, (size_x, size_y), scale))
+        forth, *more = in_parallel(ways)
+        fmap_xy = project(forth + more[0].T if more else forth)
     return fmap_xy
+
+
+class _Side(NamedTuple):
+    """What a search needs of a shape: ``(S, K)`` functions at its places, and these."""
+
+    evecs: Float[Tensor, "S K"]
+    places: Places
+
+
+def _correspondence(
+    here: _Side, there: _Side, fmap: Float[Tensor, "Kt Kh"], size: tuple[int, int], scale: float
+) -> Float[Tensor, "Lt Lh"]:
+    """Mean of ``phi(T(x)) phi(x)^T`` in ``size`` functions of either side, T found with a map from here to there."""
+    (k_there, k_here), n = fmap.shape, here.places.n_queries
+    images = torch.cat([here.evecs[:n, :k_here] @ fmap.T, scale * here.places.features[:n]], 1)
+    points = torch.cat([there.evecs[:, :k_there], scale * there.places.features], 1)
+    partners = nearest_rows(images, points, exact=False)
+    halves = zip(partners.chunk(2), here.evecs[:n].chunk(2), strict=True)
+    products = [partial(_product, there.evecs, ids, rows, size) for ids, rows in halves]
+    return torch.stack(in_parallel(products)).sum(0) / n
+
+
+def _product(evecs: Tensor, ids: Tensor, rows: Tensor, size: tuple[int, int]) -> Tensor:
+    return evecs[ids, : size[0]].T @ rows[:, : size[1]]
 
 
 def growing_pairs(start: tuple[int, int], stop: tuple[int, int], ratio: float = 1.2) -> list[tuple[int, int]]:

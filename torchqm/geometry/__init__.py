@@ -17,6 +17,7 @@ from torchqm.geometry.gradient import VertexGradient, tangent_frames, vertex_gra
 from torchqm.geometry.io import load_mesh, save_mesh
 from torchqm.geometry.laplacian import (
     Laplacian,
+    cotan_matrix,
     cotan_stiffness,
     laplacian,
     lumped_mass,
@@ -37,6 +38,7 @@ __all__ = [
     "area_samples",
     "check_mesh",
     "clean_faces",
+    "cotan_matrix",
     "cotan_stiffness",
     "diffused",
     "distance_to_curve",

@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchqm.geometry.laplacian import cotan_stiffness, to_scipy
+from torchqm.geometry.laplacian import cotan_matrix
 from torchqm.geometry.mesh import Mesh
 
 __all__ = ["mean_curvature", "vertex_normals"]
@@ -35,7 +35,7 @@ def mean_curvature(mesh: Mesh, stiffness: "scipy.sparse.csr_array | None" = None
     """
     areas = mesh.vertex_areas
     if stiffness is None:
-        stiffness = to_scipy(cotan_stiffness(mesh.verts, mesh.faces))
+        stiffness = cotan_matrix(mesh.verts, mesh.faces)
     laplacian = torch.from_numpy(stiffness @ mesh.verts.numpy()) / areas.clamp_min(1e-300)[:, None]
     values = (laplacian * vertex_normals(mesh)).sum(1) / 2
     return torch.where((areas > 0) & torch.isfinite(values), values, 0.0)

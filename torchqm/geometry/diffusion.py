@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchqm.geometry.laplacian import cotan_stiffness, to_scipy
+from torchqm.geometry.laplacian import cotan_matrix
 from torchqm.geometry.mesh import Mesh
 
 __all__ = ["diffused"]
@@ -46,7 +46,7 @@ def diffused(
     mass = mesh.vertex_areas.numpy()
     there = mass > 0
     if stiffness is None:
-        stiffness = to_scipy(cotan_stiffness(mesh.verts, mesh.faces))
+        stiffness = cotan_matrix(mesh.verts, mesh.faces)
     matrix = (scipy.sparse.diags_array(np.where(there, mass, 1.0)) + time * stiffness).tocsr()
     inverse = 1 / matrix.diagonal()
     scaling = scipy.sparse.linalg.LinearOperator(matrix.shape, matvec=lambda v: inverse * v, dtype=np.float64)

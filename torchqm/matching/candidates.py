@@ -1,7 +1,9 @@
 """The ways from the first even block to the full map, and the choice between what they give."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -10,7 +12,7 @@ from torch import Tensor
 from torchqm.fmap.refine import nearest_isometry
 from torchqm.fmap.threads import in_parallel
 from torchqm.fmap.two_way import Places, growing_pairs, two_way_upsample
-from torchqm.matching.initial import basis_size
+from torchqm.matching.initial import basis_size, split_bases
 from torchqm.matching.known import KnownSymmetry
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
 from torchqm.matching.parameters import MatchParameters
@@ -18,7 +20,7 @@ from torchqm.matching.quality import commutator_norm, distance_change
 from torchqm.matching.quotient import QuotientMatch, pair_places, refine_fmap
 from torchqm.matching.shape import PreparedShape
 from torchqm.matching.synchronize import sample_weights, synchronized_halves
-from torchqm.symmetry.basis import EvenOddBasis, symmetrized_basis
+from torchqm.symmetry.basis import EvenOddBasis
 
 __all__ = ["FullMap", "full_map_from_blocks", "sharpened"]
 
@@ -81,10 +83,12 @@ def full_map_from_blocks(
         parameters: ``k_quotient``, ``k_max``, ``growth``, ``n_samples``, ``local_weight`` are used.
     """
     even_blocks = [first]
-    places = pair_places(x, y, parameters) if parameters.refinement == "upsample" else None
+    places, weights = None, None
+    if parameters.refinement == "upsample":
+        beside: list[Callable[[], Any]] = [partial(pair_places, x, y, parameters), partial(sample_weights, x, known_x)]
+        places, weights = in_parallel(beside)
     if places is not None and min(parameters.k_quotient, parameters.k_max) > parameters.k:
         even_blocks.append(sharpened(first, x, y, known_x, known_y, parameters, places))
-    weights = None if places is None else sample_weights(x, known_x)
 
     def maps_of(block: QuotientMatch) -> tuple[FullMap, FullMap | None]:
         odd = solve_odd(
@@ -163,8 +167,7 @@ def sharpened(
         Paper, section 4.4: a fundamental domain of the quotient is enough.
     """
     k = basis_size([x.basis, y.basis], min(parameters.k_quotient, parameters.k_max))
-    bases = ((x.basis.truncate(k), known_x.group), (y.basis.truncate(k), known_y.group))
-    source, target = in_parallel([partial(symmetrized_basis, basis, group) for basis, group in bases])
+    source, target = split_bases(x, y, k, known_x.group, known_y.group)
     places_x, places_y = _half(places[0], known_x), _half(places[1], known_y)
     size = (first.fmap.shape[0], first.fmap.shape[1])
     fmap = two_way_upsample(

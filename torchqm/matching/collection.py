@@ -84,11 +84,20 @@ class Collection:
             self._files[path] = loaded
         return self._files[path]
 
+    def _load_files(self, *meshes: Mesh | str | Path | PreparedShape) -> None:
+        """Load several files at the same time."""
+        files = {Path(m).resolve(): m for m in reversed(meshes) if isinstance(m, str | Path)}
+        new = [given for path, given in reversed(files.items()) if path not in self._files]
+        if len(new) > 1:
+            with one_thread():
+                in_parallel([partial(self.load, given) for given in new])
+
     def shape(self, mesh: Mesh | str | Path | PreparedShape) -> PreparedShape:
         """The mesh made ready: checked, scaled to unit area, with its eigenpairs."""
         if isinstance(mesh, PreparedShape):
             return mesh
-        mesh = self.load(mesh)
+        if not isinstance(mesh, Mesh) or id(mesh) not in self._shapes:
+            mesh = self.load(mesh)
         if id(mesh) not in self._shapes:
             with self.steps(f"eigenpairs of {mesh.name}", COST["eigenpairs"] * mesh.n_verts / 1000):
                 prepared = self._prepared(mesh)
@@ -209,6 +218,7 @@ class Collection:
     ) -> MatchResult:
         """Match two poses; arguments and result as in :func:`match`."""
         earlier = dict(self.steps.seconds)
+        self._load_files(source, target)
         meshes = [m if isinstance(m, PreparedShape) else self.load(m) for m in (source, target)]
         self.steps.total = self.steps.done + self.expected_work(
             *meshes, symmetries=not isinstance(symmetry, str) or symmetry != "none"

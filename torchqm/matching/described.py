@@ -56,9 +56,15 @@ class PairDescriptors:
             k: functions.
             factor: one number a vertex, such as the sign that tells left from right.
         """
-        basis = x.basis.truncate(k)
-        weights = basis.evecs * (basis.mass * factor)[:, None]
-        return self.splitting.coefficients(_signatures(x.basis.truncate(self.n_functions), self.scale), weights)
+        # Blocks of vertices at the same time. Where a vertex has no area, its weights are 0, so its signature is free.
+        parts = zip(x.basis.evecs.split(_ROWS), (x.basis.mass * factor).split(_ROWS), strict=True)
+        evals = x.basis.evals[: self.n_functions]
+
+        def of_block(evecs: Tensor, weights: Tensor) -> Tensor:
+            values = _signature(SpectralBasis(evals, evecs[:, : self.n_functions], weights), self.scale)
+            return self.splitting.coefficients(values, evecs[:, :k] * weights[:, None])
+
+        return torch.stack(in_parallel([partial(of_block, *part) for part in parts])).sum(0)
 
 
 _Key = tuple[object, ...]
@@ -110,18 +116,17 @@ def _computed(
 
 def _signatures(basis: SpectralBasis, scale: WaveEnergies | Tensor) -> Float[Tensor, "V C"]:
     """Signatures at all vertices, by blocks; where a vertex has no area, the least of the others."""
-    blocks = []
-    for start in range(0, basis.n_verts, _ROWS):
-        rows = slice(start, start + _ROWS)
-        part = SpectralBasis(basis.evals, basis.evecs[rows], basis.mass[rows])
-        blocks.append(
-            wave_kernel_signature(part, scale)
-            if isinstance(scale, WaveEnergies)
-            else heat_kernel_signature(part, scale)
-        )
-    values = torch.cat(blocks)
+    starts = range(0, basis.n_verts, _ROWS)
+    parts = [SpectralBasis(basis.evals, basis.evecs[i : i + _ROWS], basis.mass[i : i + _ROWS]) for i in starts]
+    values = torch.cat([_signature(part, scale) for part in parts])
     used = basis.mass > 0
     if not bool(used.all()):
         # Eigenfunctions are 0 there; that is no value of the shape, and must not widen the ranges.
         values = torch.where(used[:, None], values, values[used].amin(0))
     return values
+
+
+def _signature(basis: SpectralBasis, scale: WaveEnergies | Tensor) -> Float[Tensor, "V C"]:
+    return (
+        wave_kernel_signature(basis, scale) if isinstance(scale, WaveEnergies) else heat_kernel_signature(basis, scale)
+    )

@@ -1,12 +1,14 @@
 """The initial functional map between two shapes, on whatever pair of bases it is wanted (paper, sections 4.3 and 5)."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchqm.fmap.solve import solve_fmap
+from torchqm.fmap.threads import in_parallel
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.basis import SpectralBasis, cluster_end
@@ -18,8 +20,17 @@ from torchqm.spectral.descriptors import (
     wave_energies,
     wave_kernel_signature,
 )
+from torchqm.symmetry.basis import EvenOddBasis, symmetrized_basis
+from torchqm.symmetry.group import SymmetryGroup
 
-__all__ = ["basis_size", "curvature_descriptors", "fmap_from_coefficients", "initial_fmap", "shared_descriptors"]
+__all__ = [
+    "basis_size",
+    "curvature_descriptors",
+    "fmap_from_coefficients",
+    "initial_fmap",
+    "shared_descriptors",
+    "split_bases",
+]
 
 SHARPEST = 30.0
 """Curvature above which it is not told how much more: 1/30 of sqrt(area) is the radius of a finger."""
@@ -34,6 +45,28 @@ def basis_size(bases: Sequence[SpectralBasis], k: int) -> int:
     A cluster cut in two is not a space that a symmetry keeps, so its functions could neither be split nor matched.
     """
     return min(cluster_end(b.evals, min(k, b.k), rtol=1e-4) for b in bases)
+
+
+def split_bases(
+    x: PreparedShape, y: PreparedShape, k: int, group_x: SymmetryGroup, group_y: SymmetryGroup
+) -> tuple[EvenOddBasis, EvenOddBasis]:
+    """The first ``k`` functions of two shapes split by their symmetries, with the functions themselves.
+
+    Args:
+        x: one shape.
+        y: the other.
+        k: functions of each.
+        group_x: symmetry of x.
+        group_y: symmetry of y.
+    """
+
+    def split(shape: PreparedShape, group: SymmetryGroup) -> EvenOddBasis:
+        found = symmetrized_basis(shape.basis.truncate(k), group)
+        in_parallel([lambda: found.even, lambda: found.odd])
+        return found
+
+    first, second = in_parallel([partial(split, x, group_x), partial(split, y, group_y)])
+    return first, second
 
 
 def shared_descriptors(bases: Sequence[SpectralBasis], parameters: MatchParameters) -> list[Float[Tensor, "_V C"]]:

@@ -62,7 +62,7 @@ def distance_change(
     samples = x.samples[:n]
     among = y.basis.truncate(k_y).restricted(y.anchors)
     partners = y.anchors[nearest_used(x.basis.evecs[samples, :k_x] @ fmap_xy.T, among, exact=False)]
-    before, after = x.basis.biharmonic(k)[samples], y.basis.biharmonic(k)[partners]
+    before, after = (b.restricted(i).biharmonic(k) for b, i in ((x.basis, samples), (y.basis, partners)))
     gaps = []
     for step in (len(samples) // 3, len(samples) // 2 + 1):
         gaps.append(((before - before.roll(step, 0)).norm(dim=1), (after - after.roll(step, 0)).norm(dim=1)))

@@ -1,7 +1,9 @@
 """Quotient-space matching of two shapes with known symmetry (paper, section 4, Algorithm 1)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -12,11 +14,11 @@ from torchqm.fmap.refine import correspondence_fmap, growing_sizes, quotient_icp
 from torchqm.fmap.threads import in_parallel
 from torchqm.fmap.two_way import Places, two_way_upsample
 from torchqm.matching.described import pair_descriptors
-from torchqm.matching.initial import basis_size, curvature_descriptors, fmap_from_coefficients
+from torchqm.matching.initial import basis_size, curvature_descriptors, fmap_from_coefficients, split_bases
 from torchqm.matching.parameters import MatchParameters
 from torchqm.matching.shape import PreparedShape
 from torchqm.spectral.features import local_features
-from torchqm.symmetry.basis import EvenOddBasis, symmetrized_basis
+from torchqm.symmetry.basis import EvenOddBasis
 from torchqm.symmetry.group import SymmetryGroup
 
 __all__ = [
@@ -91,17 +93,18 @@ def match_quotient(
         Paper, section 4.3 and 4.4.
     """
     k = basis_size([x.basis, y.basis], parameters.k if k is None else k)
-    bases = ((x.basis.truncate(k), group_x), (y.basis.truncate(k), group_y))
-    source, target = in_parallel([partial(symmetrized_basis, basis, group) for basis, group in bases])
+    curved = parameters.local_weight > 0
+    beside: list[Callable[[], Any]] = [partial(split_bases, x, y, k, group_x, group_y)]
+    beside += [partial(curvature_descriptors, x, y)] if curved else []
+    (source, target), *bends = in_parallel(beside)
     if values is None:
         described = pair_descriptors(x, y, parameters, k).coefficients
     else:
         described = source.full.coefficients(values[0]), target.full.coefficients(values[1])
     columns_x, columns_y = (s.even_coeffs.T @ c[:k] for s, c in zip((source, target), described, strict=True))
     more = None
-    if parameters.local_weight > 0:
-        bends_x, bends_y = curvature_descriptors(x, y)
-        more = source.even.coefficients(bends_x), target.even.coefficients(bends_y)
+    if curved:
+        more = source.even.coefficients(bends[0][0]), target.even.coefficients(bends[0][1])
     first = fmap_from_coefficients(
         (columns_x, columns_y), source.even.evals, target.even.evals, parameters.commutativity, more
     )

@@ -1,7 +1,9 @@
 """Semi-quotient matching: the symmetry is known on the target only (paper, section 5)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any
 
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -9,6 +11,7 @@ from torch import Tensor
 from torchqm.fmap.convert import fmap_to_p2p
 from torchqm.fmap.refine import growing_sizes, nearest_isometry, semi_quotient_icp, semi_upsample
 from torchqm.fmap.surface_search import SurfaceSearch
+from torchqm.fmap.threads import in_parallel
 from torchqm.matching.described import pair_descriptors
 from torchqm.matching.initial import basis_size, fmap_from_coefficients
 from torchqm.matching.parameters import MatchParameters
@@ -73,10 +76,13 @@ def match_semi_quotient(
     """
     k = basis_size([x.basis, y.basis], parameters.k)
     basis_x = x.basis.truncate(k)
-    target = symmetrized_basis(y.basis.truncate(k), group_y)
+    split = partial(symmetrized_basis, y.basis.truncate(k), group_y)
     if values is None:
-        columns_x, columns_y = (c[:k] for c in pair_descriptors(x, y, parameters).coefficients)
+        beside: list[Callable[[], Any]] = [partial(pair_descriptors, x, y, parameters), split]
+        described, target = in_parallel(beside)
+        columns_x, columns_y = (c[:k] for c in described.coefficients)
     else:
+        target = split()
         columns_x, columns_y = basis_x.coefficients(values[0]), target.full.coefficients(values[1])
     columns = columns_x, target.even_coeffs.T @ columns_y
     fmap = fmap_from_coefficients(columns, basis_x.evals, target.even.evals, parameters.commutativity)

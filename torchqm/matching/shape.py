@@ -97,7 +97,8 @@ def completions(shapes: Sequence[PreparedShape], curvature: bool = True) -> list
     """What is left to do for :func:`complete`, as tasks that may run beside others."""
     # Not through the properties: they lock, before Python 3.12 one for all shapes together.
     names = ["search", "curvature"] if curvature else ["search"]
-    todo = [(shape, name) for shape in dict.fromkeys(shapes) for name in names if name not in shape.__dict__]
+    # Searches first, which take longer: what is begun last should end soon.
+    todo = [(shape, name) for name in names for shape in dict.fromkeys(shapes) if name not in shape.__dict__]
     return [partial(_set, shape, name) for shape, name in todo]
 
 

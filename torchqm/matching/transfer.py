@@ -1,6 +1,9 @@
 """Symmetry transfer: from a reference shape with a known reflection to another pose of it (paper, section 6.1)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -8,6 +11,7 @@ from torch import Tensor
 
 from torchqm.fmap.convert import fmap_to_p2p
 from torchqm.fmap.refine import growing_sizes, upsample
+from torchqm.fmap.threads import in_parallel
 from torchqm.matching.described import pair_descriptors
 from torchqm.matching.odd import OddMap, join_blocks, solve_odd
 from torchqm.matching.parameters import MatchParameters
@@ -108,10 +112,14 @@ def transfer_symmetry(
     candidates = [*more, *self_maps_from_halves(x, sign, parameters, pair_descriptors(x, y, parameters))]
     settle = way == "full_map" and parameters.refinement == "upsample" and parameters.local_weight > 0
     at_choice = parameters.changed(k_max=max(parameters.k, min(K_CHOICE, parameters.k_max)))
-    found = best_self_map(candidates, x, at_choice if settle else parameters, witness=0 if more else None)
-    fmap = found.fmap
+    choose = partial(best_self_map, candidates, x, at_choice if settle else parameters, witness=0 if more else None)
     if settle:  # local features would flatter the candidates; one that is chosen they hold in its place
-        fmap = settled_self_map(fmap, x, parameters, pair_places(x, x, parameters)[0])
+        beside: list[Callable[[], Any]] = [choose, partial(pair_places, x, x, parameters)]
+        found, (places, _) = in_parallel(beside)
+        fmap = settled_self_map(found.fmap, x, parameters, places)
+    else:
+        found = choose()
+        fmap = found.fmap
     basis = x.basis.truncate(fmap.shape[0])
     group = SymmetryGroup.from_reflection(fmap_to_p2p(fmap, basis, basis, search=x.search, guide=x.search))
     moved = float(((sign != sign[group.maps[1]]) * x.mesh.vertex_areas).sum())
@@ -170,6 +178,7 @@ def halves_by_full_map(
     Returns:
         ``(Vx,)`` signs, the odd block with its residuals, and the full map.
     """
+    in_parallel([lambda: semi.source.even, lambda: semi.source.odd, lambda: semi.target.odd])
     odd = solve_odd(x.mesh, y.mesh, semi.source.even, semi.target.even, semi.even, semi.source.odd, semi.target.odd)
     fmap = join_blocks(semi.source, semi.target, semi.even, odd.fmap)
     k = min(max(k_sharp, parameters.k), x.basis.k, y.basis.k)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchqm.geometry.curvature import mean_curvature
 from torchqm.geometry.diffusion import diffused
-from torchqm.geometry.laplacian import cotan_stiffness, to_scipy
+from torchqm.geometry.laplacian import cotan_matrix
 from torchqm.geometry.mesh import Mesh
 from torchqm.spectral.basis import SpectralBasis
 from torchqm.spectral.descriptors import wave_energies, wave_kernel_signature
@@ -30,7 +30,7 @@ def smooth_curvature(mesh: Mesh) -> Float[Tensor, " V"]:
     Args:
         mesh: of area 1, consistently oriented, or the sign means nothing.
     """
-    stiffness = to_scipy(cotan_stiffness(mesh.verts, mesh.faces))
+    stiffness = cotan_matrix(mesh.verts, mesh.faces)
     sharp = mean_curvature(mesh, stiffness).clamp(-SHARPEST, SHARPEST)
     return diffused(mesh, sharp[:, None], SMOOTHING, stiffness=stiffness)[:, 0]
 

@@ -1,7 +1,6 @@
 """Bases of symmetric functions and of their complement, with their own Laplacian eigenvalues (paper, Lemma 3.1)."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -38,15 +37,21 @@ class EvenOddBasis:
     odd_evals: Float[Tensor, " Ko"]
     spectrum: Float[Tensor, " K"]
 
-    @cached_property
+    @property
     def even(self) -> SpectralBasis:
-        """Basis of the symmetric functions L2+."""
-        return SpectralBasis(self.even_evals, self.full.evecs @ self.even_coeffs, self.full.mass)
+        """Basis of the symmetric functions L2+; made when it is first asked for."""
+        return self._functions("_even", self.even_evals, self.even_coeffs)
 
-    @cached_property
+    @property
     def odd(self) -> SpectralBasis:
-        """Basis of the complement L2- (antisymmetric functions, where the group is one reflection)."""
-        return SpectralBasis(self.odd_evals, self.full.evecs @ self.odd_coeffs, self.full.mass)
+        """Basis of the complement L2- (antisymmetric functions, where the group is one reflection), likewise."""
+        return self._functions("_odd", self.odd_evals, self.odd_coeffs)
+
+    def _functions(self, name: str, evals: Tensor, coeffs: Tensor) -> SpectralBasis:
+        kept = self.__dict__.get(name)  # not a cached_property: before Python 3.12 it lets one thread in at a time
+        if kept is None:
+            kept = self.__dict__[name] = SpectralBasis(evals, self.full.evecs @ coeffs, self.full.mass)
+        return kept
 
 
 def split_by_projector(basis: SpectralBasis, projector: Float[Tensor, "K K"]) -> EvenOddBasis:

@@ -125,18 +125,19 @@ def _integrals(
     """``<phi_k, omega(f_a, f_b)>`` of all pairs, over some triangles.
 
     The form is ``(u_a v_b - v_a u_b) / 2`` with differences u, v along two edges, and the integral of a linear function
-    is the mean of its corners; so ``sum m_k u_a v_b``, a matrix product, holds both terms. No array of faces and pairs
-    is made.
+    is the mean of its corners. Only pairs ``a < b`` are computed, for a block of triangles at a time.
     """
-    k, n = evecs.shape[1], values.shape[1]
-    total = evecs.new_zeros(k * n, n)
+    n = values.shape[1]
+    a, b = torch.triu_indices(n, n, 1)
+    total = evecs.new_zeros(evecs.shape[1], len(a))
     for block in faces.split(_FACES):
         first, second, third = block.T
         means = evecs[first].add_(evecs[second]).add_(evecs[third])
         base = values[first]
-        u, v = values[second] - base, values[third] - base
-        total.addmm_((means[:, :, None] * u[:, None, :]).flatten(1).T, v)
-    omega = total.view(k, n, n) / 6
+        u, v = ((values[corner] - base).T.contiguous() for corner in (second, third))  # a pair is two rows then
+        total.addmm_(means.T, (u[a].mul_(v[b])).sub_(v[a].mul_(u[b])).T)
+    omega = evecs.new_zeros(evecs.shape[1], n, n)
+    omega[:, a, b] = total / 6
     return omega - omega.mT
 
 

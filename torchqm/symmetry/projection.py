@@ -1,5 +1,6 @@
 """The projections pi+ and pi- onto symmetric functions and their complement (paper, section 3, equation 1)."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -7,6 +8,8 @@ from torchqm.spectral.basis import SpectralBasis
 from torchqm.symmetry.group import SymmetryGroup
 
 __all__ = ["even_part", "odd_part", "projection_matrix"]
+
+_ROWS = 2048  # of a block of vertices: the mean over orbits never exists at all of them
 
 
 def even_part(values: Float[Tensor, "V C"], group: SymmetryGroup) -> Float[Tensor, "V C"]:
@@ -43,7 +46,13 @@ def projection_matrix(basis: SpectralBasis, group: SymmetryGroup) -> Float[Tenso
     Exactly a projector only if the group preserves mass and the basis cuts no eigenspace; on real shapes its
     eigenvalues crowd near 0 and 1, and :func:`torchqm.symmetry.basis.split_by_projector` cuts between them.
     """
-    return basis.coefficients(even_part(basis.evecs, group))
+    _check(basis.evecs, group)
+    total = basis.evecs.new_zeros(basis.k, basis.k)
+    for start in range(0, basis.n_verts, _ROWS):
+        rows = slice(start, start + _ROWS)
+        orbits = torch.stack([basis.evecs[element[rows]] for element in group.maps]).sum(0)
+        total = total + (basis.evecs[rows] * basis.mass[rows, None]).T @ orbits
+    return total / group.order
 
 
 def _check(values: Tensor, group: SymmetryGroup) -> None:
