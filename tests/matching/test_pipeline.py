@@ -608,6 +608,31 @@ def test_two_files_are_read_at_the_same_time(tmp_path, monkeypatch):
         collection.match(tmp_path / "nowhere1.off", tmp_path / "nowhere2.off")
 
 
+@pytest.mark.parametrize("limit", [10**6, 1000], ids=["small", "large"])
+def test_eigenpairs_of_two_small_meshes_are_computed_at_the_same_time(limit, tmp_path, monkeypatch):
+    """Small: each waits for the other. Large: the second begins when the first has ended."""
+    meshes, met, going = [creature("quadruped", n).mesh for n in (600, 700)], Barrier(2, timeout=20), []
+
+    def prepare_(mesh, *given, **named):
+        going.append(mesh)
+        if limit > 1400:
+            met.wait()
+        prepared = prepare(mesh, *given, **named)
+        assert limit > 1400 or going == [mesh]
+        going.remove(mesh)
+        return prepared
+
+    monkeypatch.setattr(module, "prepare", prepare_)
+    monkeypatch.setattr(module, "_TOGETHER", limit)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        result = Collection(parameters=FAST).match(*meshes, "none")
+    finally:
+        torch.set_num_threads(before)
+    assert {"eigenpairs of " + mesh.name for mesh in meshes} <= set(result.seconds)
+
+
 @pytest.mark.parametrize("method", ["quotient", "paper"])
 def test_every_refinement_is_carried_out(pair, method):
     source, target = (prepare(creature.mesh, 60, 600) for creature in pair[:2])

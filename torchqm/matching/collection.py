@@ -33,6 +33,9 @@ from torchqm.spectral.cache import is_cached
 
 __all__ = ["METHODS", "SYMMETRIES", "Collection"]
 
+# Vertices of two shapes whose eigenpairs are computed at the same time, each with half a gigabyte at most.
+_TOGETHER = 120_000
+
 METHODS = ("quotient", "paper", "semi")
 
 SYMMETRIES = ("auto", "extrinsic", "detect", "none")
@@ -109,9 +112,13 @@ class Collection:
         return prepare(mesh, p.k_max, max(p.n_samples, N_ANCHORS), p.seed, cache_dir=self.cache_dir)
 
     def _read(self, *meshes: Mesh | PreparedShape) -> None:
-        """Make several meshes ready at the same time, if their eigenpairs are only read from the cache."""
+        """Make several meshes ready at the same time: read from the cache, or computed where memory allows it."""
         new = [m for m in dict.fromkeys(meshes) if isinstance(m, Mesh) and id(m) not in self._shapes]
-        if len(new) < 2 or not all(is_cached(m, self.parameters.k_max, cache_dir=self.cache_dir) for m in new):
+        # Products of one run are bound by memory, so on few cores two runs do not take twice as long as one.
+        few = sum(m.n_verts for m in new) <= _TOGETHER and torch.get_num_threads() <= 2 * len(new)
+        if len(new) < 2:
+            return
+        if not few and not all(is_cached(m, self.parameters.k_max, cache_dir=self.cache_dir) for m in new):
             return
         prepared: list[PreparedShape] = []
         for number, mesh in enumerate(new):
