@@ -2,6 +2,9 @@
 
 import os
 import re
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event, get_ident
 
 import numpy as np
 import pytest
@@ -385,3 +388,31 @@ def test_the_quick_way_for_off_reads_what_the_slow_one_reads(tmp_path, text, pla
         for quick, wanted in zip(found, slow, strict=True):
             assert quick.dtype == wanted.dtype
             assert np.array_equal(quick, wanted)
+
+
+def test_files_read_at_the_same_time_leave_the_filters_of_warnings_alone(tmp_path, monkeypatch):
+    """They are the whole process's. If a second reader comes in while the first is inside, and leaves last, they stay."""
+    path = tmp_path / "a.off"
+    path.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    second_in, first_out, before, inside = Event(), Event(), list(warnings.filters), []
+    real = np.fromstring
+
+    def slowly(*given, **named):
+        inside.append(get_ident())
+        if len(inside) == 1:
+            second_in.wait(0.3)
+        elif inside[-1] != inside[0] and not second_in.is_set():
+            second_in.set()
+            first_out.wait(0.3)
+        return real(*given, **named)
+
+    def load(path):
+        mesh = load_mesh(path)
+        first_out.set()
+        return mesh
+
+    monkeypatch.setattr(np, "fromstring", slowly)
+    with ThreadPoolExecutor(2) as pool:
+        meshes = list(pool.map(load, [path, path]))
+    assert [mesh.n_faces for mesh in meshes] == [1, 1]
+    assert warnings.filters == before

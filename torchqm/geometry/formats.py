@@ -5,6 +5,7 @@ import warnings
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,9 @@ import numpy as np
 from torchqm.geometry.check import MeshError
 
 __all__ = ["READERS", "numbers"]
+
+# The filters of warnings are the whole process's: two files read at the same time would leave each other's behind.
+_FILTERS = RLock()
 
 _OFF_EDGE = re.compile(r"(?:2\s+)?\d+\s+\d+")
 _OFF_HEADER = re.compile(r"^(?:(?:ST)?C?N?OFF\b|OFF(?=\d))")  # some writers glue the counts to the header: OFF490 518 0
@@ -81,7 +85,7 @@ def numbers(text: str, kind: type = np.float64) -> np.ndarray | None:
     if not text:
         return np.zeros(0, dtype=kind)
     try:
-        with warnings.catch_warnings():
+        with _FILTERS, warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)  # numpy's way of saying that it stopped early
             return np.fromstring(text, dtype=kind, sep=" ")
     except (DeprecationWarning, ValueError):
@@ -264,7 +268,7 @@ def _through_trimesh(path: Path, kind: str) -> tuple[np.ndarray, np.ndarray]:
     import trimesh
 
     try:
-        with path.open("rb") as file, warnings.catch_warnings():
+        with path.open("rb") as file, _FILTERS, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             loaded = trimesh.load(file, file_type=kind, process=False)
     except Exception as error:  # a broken file can end in any exception of the parser

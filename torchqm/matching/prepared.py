@@ -36,7 +36,7 @@ __all__ = ["COST", "DETECTION", "POOR_SCORE", "match_prepared"]
 POOR_SCORE = 0.15
 """Commutativity score above which a map is called poor; true maps of TOSCA have 0.03 (wolf) to 0.13 (cat)."""
 
-COST = {"eigenpairs": 0.3, "plane": 0.025, "detect": 0.1, "transfer": 0.16, "quotient": 0.045, "maps": 0.07}
+COST = {"eigenpairs": 0.05, "plane": 0.02, "detect": 0.1, "transfer": 0.04, "quotient": 0.005, "maps": 0.03}
 """Expected seconds per step and 1000 vertices, for the share of work done; only their ratios matter."""
 
 DETECTION = 2.5
