@@ -391,7 +391,7 @@ def test_the_quick_way_for_off_reads_what_the_slow_one_reads(tmp_path, text, pla
 
 
 def test_files_read_at_the_same_time_leave_the_filters_of_warnings_alone(tmp_path, monkeypatch):
-    """They are the whole process's. If a second reader comes in while the first is inside, and leaves last, they stay."""
+    """If a second reader came in while the first is inside and left last, the first one's filters would stay."""
     path = tmp_path / "a.off"
     path.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     second_in, first_out, before, inside = Event(), Event(), list(warnings.filters), []
