@@ -5,6 +5,7 @@ Each row of a functional map solves ``(gram + diag(d_i)) c_i = r_i``. The solve 
 take it as one piece, and the check for undetermined rows runs inside them, too.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -117,7 +118,7 @@ class _Solve(torch.autograd.Function):
             u = _solver_again().apply(gram, diagonal, grad, factor)
         else:
             u = _solver().apply(gram, diagonal, grad, ctx.row_chunk, False, False)[0]
-        return *_gradients(rows, u), None, None, None
+        return *_gradients(rows, u, ctx.needs_input_grad), None, None, None
 
 
 class _SolveAgain(torch.autograd.Function):
@@ -138,7 +139,8 @@ class _SolveAgain(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         gram, diagonal, rows, factor = ctx.saved_tensors
-        return *_gradients(rows, _solver_again().apply(gram, diagonal, grad, factor)), None
+        u = _solver_again().apply(gram, diagonal, grad, factor)
+        return *_gradients(rows, u, ctx.needs_input_grad), None
 
 
 class _SolveForward(_Solve):
@@ -171,6 +173,10 @@ def _moved(rows: Tensor, gram: Tensor | None, diagonal: Tensor | None, rhs: Tens
     return moved if diagonal is None else moved - diagonal * rows
 
 
-def _gradients(rows: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    product = u.mT @ rows
-    return -0.5 * (product + product.mT), -u * rows, u
+def _gradients(rows: Tensor, u: Tensor, needed: Sequence[bool]) -> tuple[Tensor | None, Tensor | None, Tensor]:
+    """For ``gram``, ``diagonal`` and ``rhs``; None for the first two where nobody asks."""
+    gram = None
+    if needed[0]:
+        product = u.mT @ rows
+        gram = (product + product.mT).mul(-0.5)
+    return gram, -u * rows if needed[1] else None, u
