@@ -5,7 +5,6 @@ import sys
 from importlib.machinery import EXTENSION_SUFFIXES
 
 import pytest
-import torch
 
 from torchqm import native
 from torchqm.fmap import compiled
@@ -16,10 +15,8 @@ def empty(tmp_path, monkeypatch):
     """As if nothing had been built."""
     monkeypatch.setattr(native, "_PACKAGE", tmp_path)
     native.library.cache_clear()
-    compiled._load.cache_clear()
     yield tmp_path
     native.library.cache_clear()
-    compiled._load.cache_clear()
 
 
 @pytest.mark.parametrize("file", [False, True], ids=["not built", "of another system"])
@@ -29,7 +26,13 @@ def test_where_it_is_missing_there_is_none(file, empty):
         (empty / f"fmap/_rows{EXTENSION_SUFFIXES[0]}").write_text("not a library")
     assert native.available() == []
     assert native.library("fmap/_rows") is None
-    assert compiled.kernel_for(torch.device("cpu"), torch.float32) is None
+    assert compiled._kernels() == {}
+
+
+@pytest.mark.skipif(not native.available(), reason="nothing is built here")
+def test_what_was_built_of_other_files_is_left_alone(monkeypatch):
+    monkeypatch.setattr(native, "_ABI", native._ABI + 1)
+    assert native.available() == []
 
 
 def test_the_version_says_what_is_there_without_loading_torch():

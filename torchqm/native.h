@@ -1,4 +1,4 @@
-/* What the C files share: vectors, several versions of a function for several processors, and threads.
+/* What the C files share: vectors, versions of a function for several processors, and threads.
  *
  * Plain C with the vector types of GCC and Clang, no Python: torchqm/native.py loads the libraries by ctypes. Where they
  * cannot be built, others do the same more slowly. */
@@ -14,27 +14,35 @@
 #define INLINE static inline __attribute__((always_inline))
 #define EXPORT __attribute__((visibility("default")))
 
-/* BYTES of a vector; CLONES: one version each for processors with AVX-512, with AVX2, and others. */
-#if defined(__x86_64__) && defined(__GLIBC__)
+/* BYTES of a vector, and whether this processor has the instructions without which other libraries are faster. VERSIONS
+ * makes `static void name(void *)` of an inlined function `name_body`: compiled for AVX-512, for AVX2 and for any processor,
+ * and chosen when it is called. (On ARM it was never measured.) */
+#if defined(__x86_64__)
 #define BYTES 32
-#define CLONES __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
-#define FAST (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
-#elif defined(__AVX2__) && defined(__FMA__)
-#define BYTES 32
-#define CLONES
-#define FAST 1
-#elif defined(__aarch64__)
-#define BYTES 16
-#define CLONES
-#define FAST 1
+#define HAS(feature) __builtin_cpu_supports(feature)
+#define AVX2 (HAS("avx2") && HAS("fma"))
+#define AVX512 (AVX2 && HAS("avx512f") && HAS("avx512vl") && HAS("avx512dq") && HAS("avx512bw"))
+#define FAST AVX2
+#define VERSIONS(name)                                                                                                       \
+    __attribute__((target("avx512f,avx512vl,avx512dq,avx512bw,avx2,fma"))) static void name##_512(void *t) { name##_body(t); } \
+    __attribute__((target("avx2,fma"))) static void name##_256(void *t) { name##_body(t); }                                  \
+    static void name##_128(void *t) { name##_body(t); }                                                                      \
+    static void name(void *t) { (AVX512 ? name##_512 : AVX2 ? name##_256 : name##_128)(t); }
 #else
 #define BYTES 16
-#define CLONES
+#ifdef __aarch64__
+#define FAST 1
+#else
 #define FAST 0
 #endif
+#define VERSIONS(name) \
+    static void name(void *t) { name##_body(t); }
+#endif
 
-/* Whether this processor has the vector instructions without which other libraries are faster. */
 EXPORT int fast(void) { return FAST; }
+
+/* Raised with every change of what an exported function takes: what was built of older files is then left alone. */
+EXPORT int abi(void) { return 1; }
 
 /* Ask for large pages for memory that nobody has touched: a fault for each of 4 kB took longer than the factors that
  * were written there. No more than advice; where it is not taken, nothing else changes. */
@@ -80,4 +88,4 @@ static void in_threads(void (*run)(void *), void *task, int n) {
 }
 
 /* The next part that no thread has taken. */
-static int64_t take(int64_t *next) { return __atomic_fetch_add(next, 1, __ATOMIC_RELAXED); }
+INLINE int64_t take(int64_t *next) { return __atomic_fetch_add(next, 1, __ATOMIC_RELAXED); }

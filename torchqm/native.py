@@ -1,8 +1,8 @@
 """Finds what was built from our C files, if it was, and lets it share torch's threads.
 
-``pip install`` builds them where there is a C compiler with GCC's vector types (GCC or Clang). Without them other
-libraries do the same: functional maps take three times, eigenpairs one and a half times as long. ``torchqm --version``
-says which are there.
+``pip install`` builds them where there is a C compiler with GCC's vector types: GCC, or Clang, whose code for the rows of
+functional maps takes twice as long. Without them other libraries do the same work in several times as long. ``torchqm --version``
+says which are there. After a change of a C file they have to be installed anew.
 """
 
 import ctypes
@@ -16,6 +16,7 @@ __all__ = ["LIBRARIES", "available", "library"]
 LIBRARIES = ("fmap/_rows", "spectral/_ldl", "spectral/_projections")
 
 _PACKAGE = Path(__file__).parent
+_ABI = 1  # of native.h
 # OpenMP's function, where torch has loaded it; its threads are then torch's own.
 _TEAM = "GOMP_parallel"
 
@@ -47,5 +48,7 @@ def _load(name: str) -> ctypes.CDLL | None:
                 loaded = ctypes.CDLL(str(path))
             except OSError:  # of another system
                 continue
+            if not hasattr(loaded, "abi") or loaded.abi() != _ABI:  # built before the Python files changed
+                return None
             return loaded if loaded.fast() else None
     return None

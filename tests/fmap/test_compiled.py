@@ -20,11 +20,6 @@ def problem(n, ky, kx, dtype=torch.float64, seed=0):
     return a @ a.mT, d.square(), r
 
 
-def forget():
-    native.library.cache_clear()
-    compiled._load.cache_clear()
-
-
 def dense(gram, diagonal, rhs):
     systems = gram[:, None].double() + torch.diag_embed(diagonal.double())
     return torch.linalg.solve(systems, rhs.double())
@@ -49,22 +44,30 @@ def test_as_dense_solves_with_the_factor_and_without(dtype, eps, ky, kx):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_nothing_around_its_results_is_written_and_any_alignment_will_do(dtype):
+@pytest.mark.parametrize("shift", [1, 3])
+@pytest.mark.parametrize(("ky", "kx"), [(5, 7), (8, 8)])
+def test_nothing_around_its_results_is_written_and_any_alignment_will_do(dtype, shift, ky, kx):
     """Memory that starts in the middle of a vector register, between two walls."""
-    gram, diagonal, rhs = problem(2, 5, 7, dtype)
+    given = problem(2, ky, kx, dtype)
     kernel = kernel_for(CPU, dtype)
-    shape = kernel.factor_shape(2, 5, 7)
-    rows, _, factor = kernel.solve(gram, diagonal, rhs, noise(gram), keep=True)
-    for shift in (1, 3):
-        walls = torch.full((shift + factor.numel() + 8,), 7.0, dtype=dtype)
-        moved = walls[shift : shift + factor.numel()].view(shape).copy_(factor)
-        sides = []
-        for side in (gram, diagonal, rhs):
-            room = torch.full((shift + side.numel(),), torch.nan, dtype=dtype)
-            sides.append(room[shift:].view(side.shape).copy_(side))
-        assert torch.equal(kernel.solve(*sides, noise(gram), keep=False)[0], rows)
-        assert torch.equal(kernel.solve_again(moved, sides[2]), rows)
-        assert torch.equal(walls[:shift], torch.full((shift,), 7.0, dtype=dtype))
+    rows, _, factor = kernel.solve(*given, noise(given[0]), keep=True)
+
+    def walled(like):
+        room = torch.full((shift + like.numel() + 16,), 7.0).to(like.dtype)
+        return room, room[shift : shift + like.numel()].view(like.shape)
+
+    fine = torch.ones(2, ky, dtype=torch.uint8)
+    rooms, inside = zip(*(walled(like) for like in (*given, rows, factor, fine, rows)), strict=True)
+    for target, source in zip(inside, given, strict=False):
+        target.copy_(source)
+    at = [tensor.data_ptr() for tensor in inside]
+    assert kernel._solve(*at[:3], noise(given[0]), 2, kx, ky, 2, *at[3:6]) == 0
+    assert kernel._again(at[4], at[2], 2, kx, ky, 2, at[6]) == 0
+    for found, wanted in zip(inside, (*given, rows, factor, fine, rows), strict=True):
+        assert torch.equal(found, wanted)
+    for room, tensor in zip(rooms, inside, strict=True):
+        assert bool((room[:shift] == 7).all())
+        assert bool((room[shift + tensor.numel() :] == 7).all())
 
 
 def test_views_are_read_as_what_they_show():
@@ -144,18 +147,27 @@ def test_more_threads_than_groups_change_nothing(team, monkeypatch):
     monkeypatch.setattr(compiled, "_WORTH_THREADS", {"again": 0, "anew": 0})
     if not team:
         monkeypatch.setattr(native, "_TEAM", "no such function")
-    forget()
+    native.library.cache_clear()
     try:
         torch.set_num_threads(7)
-        kernel = kernel_for(CPU, torch.float32)
+        kernel = compiled._kernels()[torch.float32]
         found = kernel.solve(gram, diagonal, rhs, noise(gram), keep=True)
         assert all(torch.equal(ours, wanted) for ours, wanted in zip(found, expected, strict=True))
         assert torch.equal(kernel.solve_again(found[2], rhs), expected[0])
     finally:
         torch.set_num_threads(before)
         monkeypatch.undo()
-        forget()
-        kernel_for(CPU, torch.float32)
+        native.library.cache_clear()
+        compiled._kernels()  # torch's threads again
+
+
+def test_tensors_elsewhere_or_of_other_sizes_are_refused():
+    gram, diagonal, rhs = problem(2, 9, 20)
+    kernel = kernel_for(CPU, torch.float64)
+    with pytest.raises(ValueError, match="rhs: is on meta, the others on the CPU"):
+        kernel.solve(gram, diagonal, rhs.to("meta"), 0.0, keep=False)
+    with pytest.raises(ValueError, match=r"shapes \[\(2, 20, 20\), \(2, 8, 20\), \(2, 9, 20\)\] given"):
+        kernel.solve(gram, diagonal[:, :8], rhs, 0.0, keep=False)
 
 
 def test_a_factor_of_other_sizes_is_refused():

@@ -1,8 +1,13 @@
 """torchqm.fmap.row_operators: both ways agree, and LAPACK's keeps to its chunks and threads."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 import torch
 
+from torchqm.fmap import compiled
 from torchqm.fmap import row_operators as module
 from torchqm.fmap.compiled import kernel_for
 from torchqm.fmap.rows import solve_rows
@@ -18,7 +23,7 @@ def problem(*leading, kx=5, ky=4, dtype=torch.float64):
 
 @pytest.fixture
 def by_library(monkeypatch):
-    monkeypatch.setattr(module, "kernel_for", lambda *_: None)
+    monkeypatch.setattr(compiled, "KERNELS", {})
 
 
 @pytest.fixture
@@ -64,11 +69,28 @@ def test_both_ways_give_the_same_rows_and_gradients(dtype, eps, monkeypatch):
     for _ in range(2):
         rows = solve_rows(*given)
         found.append([rows, *torch.autograd.grad(rows, given, weight)])
-        monkeypatch.setattr(module, "kernel_for", lambda *_: None)
+        monkeypatch.setattr(compiled, "KERNELS", {})
     for ours, expected in zip(*found, strict=True):
         assert (ours - expected).norm() < eps * expected.norm()
 
 
 def test_a_factor_whose_kernel_is_gone_is_refused(by_library):
-    with pytest.raises(ValueError, match="factor: made by a kernel that is not here"):
+    with pytest.raises(ValueError, match="asked of a kernel that is not here"):
         torch.ops.torchqm.solve_rows_again(torch.ones(1, 2, 3), torch.ones(1, 1, 8))
+
+
+def test_what_the_disk_keeps_of_compiled_code_is_not_taken_with_another_factor(tmp_path):
+    """Compiled with the kernel, then without, then with: one folder for all three processes."""
+    code = (
+        "import sys, torch; from torchqm.fmap import compiled; from torchqm.fmap.rows import solve_rows\n"
+        "if sys.argv[1] == 'library': compiled.KERNELS.clear()\n"
+        "g = torch.eye(5).requires_grad_()\n"
+        "f = torch.compile(lambda g: solve_rows(g, torch.ones(4, 5), torch.ones(4, 5)).sum(), backend='aot_eager')\n"
+        "f(g).backward(); print(round(float(g.grad.sum()), 3))"
+    )
+    environment = {**os.environ, "TORCHINDUCTOR_CACHE_DIR": str(tmp_path)}
+    for way in ("compiled", "library", "compiled"):
+        done = subprocess.run(
+            [sys.executable, "-c", code, way], env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.stdout == "-25.0\n", done.stderr

@@ -13,6 +13,7 @@ from torch.utils._pytree import tree_leaves
 from torchqm.fmap import cholesky, compiled
 from torchqm.fmap import row_operators as module
 from torchqm.fmap.compiled import kernel_for
+from torchqm.fmap.row_operators import solved_rows
 from torchqm.fmap.rows import UndeterminedRowsError, solve_rows
 from torchqm.testing import gradcheck64
 
@@ -21,7 +22,7 @@ from torchqm.testing import gradcheck64
 def way(request, monkeypatch):
     """Everything here holds for both."""
     if request.param == "library":
-        monkeypatch.setattr(module, "kernel_for", lambda *_: None)
+        monkeypatch.setattr(compiled, "KERNELS", {})
     elif kernel_for(torch.device("cpu"), torch.float64) is None:
         pytest.skip("no compiled kernel here")
     return request.param
@@ -54,6 +55,45 @@ def test_as_dense_solves(leading, kx, ky, row_chunk):
     a.requires_grad_()  # so that the factor is kept
     systems = (a @ a.mT)[..., None, :, :] + torch.diag_embed(d)
     torch.testing.assert_close(solve(a, d, r, row_chunk), torch.linalg.solve(systems, r), atol=1e-11, rtol=1e-10)
+
+
+@pytest.mark.parametrize("other", [torch.float32, torch.int64, torch.bool])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_matrix_says_in_which_precision(dtype, other):
+    """Right-hand sides and diagonals of other types, as autocast makes them, or whole numbers."""
+    a, d, r = (tensor.to(dtype) for tensor in problem(2))
+    gram = a @ a.mT
+    d, r = d.round().to(other), r.round().to(other)
+    found = unchecked(solved_rows)(gram, d, r, 0, True, True, module.is_packed(gram))
+    expected = torch.linalg.solve(gram[:, None].double() + torch.diag_embed(d.double()), r.double())
+    assert found[0].dtype == found[1].dtype == dtype
+    torch.testing.assert_close(found[0].double(), expected, atol=1e-4, rtol=1e-4)
+    again = unchecked(module._solve_rows_again)(r, found[1])
+    assert again.dtype == dtype
+    torch.testing.assert_close(again, found[0])
+
+
+def test_autocast():
+    a, d, r = (tensor.float() for tensor in problem(2))
+    gram = (a @ a.mT).requires_grad_()
+    with torch.autocast("cpu"):
+        rows = solve_rows(gram, d, r.bfloat16())
+    assert rows.dtype == torch.float32
+    torch.testing.assert_close(rows, solve_rows(gram, d, r.bfloat16().float()))
+    (grad,) = torch.autograd.grad(rows.sum(), gram)
+    assert bool(torch.isfinite(grad).all())
+
+
+def test_a_chunk_bounds_the_threads_of_the_kernel(way, threads_of_torch, monkeypatch):
+    if way == "library":
+        pytest.skip("see test_row_operators")
+    threads_of_torch(5)
+    asked, kernel = [], kernel_for(torch.device("cpu"), torch.float64)
+    real = kernel._solve
+    monkeypatch.setattr(kernel, "_solve", lambda *given: asked.append(given[7]) or real(*given))
+    for row_chunk in (None, 1, 8, 100):
+        solve(*problem(2, kx=6, ky=60), row_chunk)
+    assert asked == [5, 1, 2 * 8 // kernel.lanes if kernel.lanes > 3 else 5, 5]
 
 
 def test_nothing_to_solve():
@@ -226,7 +266,7 @@ def test_the_factor_is_the_only_tensor_of_its_size(keep, way, monkeypatch):
     whole, gram = 8 * factor_size(way, 2, 60, 40), a @ a.mT
     monkeypatch.setattr("torchqm.fmap.cholesky._AT_ONCE", {"cpu": 2 * 5 * 40 * 40})
     with Storages() as seen:
-        _, factor = module._solve_rows(gram, d, r, 0, keep, True)
+        _, factor = module._solve_rows(gram, d, r, 0, keep, True, way == "compiled")
     large = [size for size in seen.sizes.values() if size > whole / 10]
     assert large == ([whole] if keep else [])
     if keep:
@@ -291,11 +331,12 @@ def test_refusals():
 def test_outside_compiled_code_the_compiler_is_not_loaded_and_the_answer_is_the_operators():
     """Loading it takes seconds, and every first match in a process had to wait for it."""
     code = (
-        "import sys, torch; from torchqm.fmap.rows import solve_rows\n"
+        "import sys, torch; from torchqm.fmap.rows import is_packed, solve_rows\n"
         "g, d = torch.eye(2), torch.tensor([[0.0, 3.0], [3.0, 15.0]])\n"
         "found = solve_rows(g, d, torch.ones(2, 2))\n"
         "loaded = 'torch._dynamo' in sys.modules\n"
-        "print(loaded, torch.equal(found, torch.ops.torchqm.solve_rows(g, d, torch.ones(2, 2), 0, False, True)[0]))"
+        "given = g, d, torch.ones(2, 2), 0, False, True, is_packed(g)\n"
+        "print(loaded, torch.equal(found, torch.ops.torchqm.solve_rows(*given)[0]))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False", "True"]

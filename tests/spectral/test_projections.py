@@ -70,3 +70,13 @@ def test_memory_in_large_pages_is_memory():
     vectors = for_products(torch.empty(3, 2**20, dtype=torch.float64))
     vectors.fill_(2.0)
     assert float(vectors.sum()) == 6 * 2**20
+
+
+def test_what_does_not_fit_is_refused_and_views_are_what_they_show():
+    vectors, rows = noise(5, 50), noise(16, 50, seed=1)
+    with pytest.raises(RuntimeError):
+        project(vectors[:, :40].contiguous(), rows)
+    with pytest.raises(ValueError, match=r"products: \(4, 16\) given, \(5, 16\) expected"):
+        subtract_(rows, vectors, noise(4, 16))
+    torch.testing.assert_close(project(torch._neg_view(-vectors), rows), vectors @ rows.T)
+    assert project(vectors.requires_grad_(), rows).requires_grad

@@ -1,5 +1,7 @@
 """torchqm.spectral.sparse_solve: our sweeps and cholespy's against dense inverses, and matrices that have no factor."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -75,3 +77,26 @@ def test_a_diagonal_matrix_and_one_of_a_single_row():
         found = factor.filtered(torch.ones(1, len(diagonal), dtype=torch.float64))
         order = range(len(diagonal)) if factor.order is None else factor.order
         assert found[0].tolist() == pytest.approx([1 / (diagonal[i] + 1) for i in order], rel=1e-15)
+
+
+def test_two_threads_may_use_one_factor():
+    factor = factorize(grid(30), 0.5, CPU)
+    given = [noise(16, 900) * scale for scale in (1.0, 2.0)]
+    expected = [factor.filtered(rows, 0.3, 2) for rows in given]
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(20):
+            found = list(pool.map(lambda rows: factor.filtered(rows, 0.3, 2), given))
+            assert all(torch.equal(one, wanted) for one, wanted in zip(found, expected, strict=True))
+
+
+@pytest.mark.parametrize("rows", [torch.ones(3, 143).double(), torch.ones(3, 144), torch.ones(144).double()])
+def test_rows_of_another_kind_are_refused(rows, way):
+    if way == "cholespy":
+        pytest.skip("cholespy says so in its own words")
+    with pytest.raises(ValueError, match=r"rows: .* given, expected \(m, 144\), torch.float64 on cpu"):
+        factorize(grid(12), 0.5, CPU).filtered(rows)
+
+
+def test_without_qdldl_cholespy_is_asked(monkeypatch):
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    assert factorize(grid(5), 0.5, CPU).order is None

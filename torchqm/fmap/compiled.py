@@ -6,7 +6,6 @@ if there is a C compiler; else :mod:`torchqm.fmap.cholesky` does the same with L
 """
 
 import ctypes
-from functools import cache
 from math import prod
 
 import torch
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from torchqm.native import library
 
-__all__ = ["Kernel", "kernel_for"]
+__all__ = ["KERNELS", "Kernel", "kernel_for"]
 
 _NAMES = {torch.float32: ("float", ctypes.c_float), torch.float64: ("double", ctypes.c_double)}
 # Numbers in the factors of a call from which on several threads gain more than they cost, in a solve that
@@ -34,6 +33,7 @@ class Kernel:
 
     def __init__(self, built: ctypes.CDLL, dtype: torch.dtype) -> None:
         name, real = _NAMES[dtype]
+        self.dtype = dtype
         self.lanes, self._tile = getattr(built, f"lanes_{name}")(), built.tile()
         at, size = ctypes.c_void_p, ctypes.c_int64
         self._large_pages = built.large_pages
@@ -48,20 +48,24 @@ class Kernel:
         return n, groups, self._tile**2 // 2 * blocks * (blocks + 1) * self.lanes
 
     def solve(
-        self, gram: Tensor, diagonal: Tensor, rhs: Tensor, noise: float, keep: bool
+        self, gram: Tensor, diagonal: Tensor, rhs: Tensor, noise: float, keep: bool, threads: int | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The rows, which of them are undetermined, and the factors (empty unless kept).
 
         Args:
-            gram: ``(n, Kx, Kx)``; what is below its diagonal is not used.
-            diagonal: ``(n, Ky, Kx)``.
-            rhs: ``(n, Ky, Kx)``.
+            gram: ``(n, Kx, Kx)`` of the kernel's type; what is below its diagonal is not used.
+            diagonal: ``(n, Ky, Kx)``, of this type or another.
+            rhs: ``(n, Ky, Kx)``, likewise.
             noise: below which share of its largest eigenvalue the smallest one of a system of unit diagonal counts as
                 zero. 0: only those are undetermined that have no factor.
             keep: the factors.
+            threads: at most so many; None: as many as torch has.
         """
         n, ky, kx = rhs.shape
-        gram, diagonal, rhs = (_plain(tensor) for tensor in (gram, diagonal, rhs))
+        if gram.shape != (n, kx, kx) or diagonal.shape != rhs.shape:
+            shapes = [tuple(tensor.shape) for tensor in (gram, diagonal, rhs)]
+            raise ValueError(f"gram, diagonal, rhs: shapes {shapes} given, which do not fit")
+        gram, diagonal, rhs = self._plain("gram", gram), self._plain("diagonal", diagonal), self._plain("rhs", rhs)
         shape = self.factor_shape(n, ky, kx)
         factor = rhs.new_empty(shape if keep else 0)
         if factor.nbytes >= _LARGE:
@@ -69,8 +73,9 @@ class Kernel:
         rows, fine = torch.empty_like(rhs), torch.empty(n, ky, dtype=torch.bool, device=rhs.device)
         given = [tensor.data_ptr() for tensor in (gram, diagonal, rhs)]
         made = rows.data_ptr(), factor.data_ptr() if keep else None, fine.data_ptr()
-        threads = torch.get_num_threads() if prod(shape) >= _WORTH_THREADS["anew"] else 1
-        _succeed(self._solve(*given, noise, n, kx, ky, threads, *made))
+        most = min(torch.get_num_threads(), n * shape[1], threads or n * shape[1])
+        worth = most if prod(shape) >= _WORTH_THREADS["anew"] else 1
+        _succeed(self._solve(*given, noise, n, kx, ky, worth, *made))
         return rows, ~fine, factor
 
     def solve_again(self, factor: Tensor, rhs: Tensor) -> Tensor:
@@ -78,11 +83,18 @@ class Kernel:
         n, ky, kx = rhs.shape
         if factor.shape != self.factor_shape(n, ky, kx):
             raise ValueError(f"factor: {tuple(factor.shape)} given, {self.factor_shape(n, ky, kx)} expected")
-        factor, rhs = _plain(factor), _plain(rhs)
+        factor, rhs = self._plain("factor", factor), self._plain("rhs", rhs)
         rows = torch.empty_like(rhs)
-        threads = torch.get_num_threads() if factor.numel() >= _WORTH_THREADS["again"] else 1
-        _succeed(self._again(factor.data_ptr(), rhs.data_ptr(), n, kx, ky, threads, rows.data_ptr()))
+        threads = min(torch.get_num_threads(), n * factor.shape[1])
+        worth = threads if factor.numel() >= _WORTH_THREADS["again"] else 1
+        _succeed(self._again(factor.data_ptr(), rhs.data_ptr(), n, kx, ky, worth, rows.data_ptr()))
         return rows
+
+    def _plain(self, name: str, tensor: Tensor) -> Tensor:
+        """As C reads it."""
+        if tensor.device.type != "cpu":
+            raise ValueError(f"{name}: is on {tensor.device}, the others on the CPU")
+        return tensor.to(self.dtype).resolve_neg().contiguous()
 
 
 def kernel_for(device: torch.device, dtype: torch.dtype) -> Kernel | None:
@@ -92,19 +104,18 @@ def kernel_for(device: torch.device, dtype: torch.dtype) -> Kernel | None:
         >>> kernel_for(torch.device("cpu"), torch.half) is None
         True
     """
-    return _load(dtype) if device.type == "cpu" and dtype in _NAMES else None
+    return KERNELS.get(dtype) if device.type == "cpu" else None
 
 
-@cache
-def _load(dtype: torch.dtype) -> Kernel | None:
+def _kernels() -> dict[torch.dtype, Kernel]:
     built = library("fmap/_rows")
-    return None if built is None else Kernel(built, dtype)
-
-
-def _plain(tensor: Tensor) -> Tensor:
-    return tensor.resolve_neg().contiguous()
+    return {} if built is None else {dtype: Kernel(built, dtype) for dtype in _NAMES}
 
 
 def _succeed(failed: int) -> None:
     if failed:
         raise MemoryError("no memory for the factor of a functional map's rows")
+
+
+KERNELS = _kernels()
+"""By type; made at once and not when they are asked for, so that ``torch.compile`` can look them up."""

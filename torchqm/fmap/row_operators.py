@@ -13,11 +13,11 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from torchqm.fmap.cholesky import factorize, noise, rows_at_once, solve_checked, solve_factored, surely_regular
-from torchqm.fmap.compiled import kernel_for
+from torchqm.fmap.compiled import Kernel, kernel_for
 from torchqm.fmap.operator import operator
 from torchqm.fmap.threads import in_shares
 
-__all__ = ["UndeterminedRowsError", "solved_rows"]
+__all__ = ["UndeterminedRowsError", "is_packed", "solved_rows"]
 
 # Numbers in all systems of a call from which on several threads gain more than they cost. Measured.
 _WORTH_THREADS = 2**20
@@ -53,7 +53,7 @@ class UndeterminedRowsError(ValueError):
 
 
 def solved_rows(
-    gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool, check: bool
+    gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool, check: bool, packed: bool
 ) -> tuple[Tensor, Tensor]:
     """The rows, and what a backward pass needs of their systems, empty unless ``keep``.
 
@@ -64,17 +64,19 @@ def solved_rows(
         row_chunk: at most so many rows of all samples at once; 0: no limit.
         keep: the factors.
         check: find systems that are singular to working precision; else only those are found that have no factor.
+        packed: by our kernel; see :func:`is_packed`.
     """
     ky, kx = rhs.shape[-2:]
     n = prod(rhs.shape[:-2])
     if rhs.numel() == 0:
-        return rhs.clone(), gram.new_empty(_factor_shape(gram, n, ky, kx) if keep else 0)
-    kernel = kernel_for(gram.device, gram.dtype)
+        return rhs.clone(), gram.new_empty(_factor_shape(gram, n, ky, kx, packed) if keep else 0)
     sides = gram.reshape(n, kx, kx), diagonal.reshape(n, ky, kx), rhs.reshape(n, ky, kx)
-    if kernel is None:
-        rows, undetermined, factor = _solved_by_library(*sides, row_chunk, keep, check)
+    if packed:
+        kernel = _kernel(gram)
+        threads = max(1, row_chunk * n // kernel.lanes) if row_chunk else None  # each has a group of rows in memory
+        rows, undetermined, factor = kernel.solve(*sides, noise(gram) if check else 0.0, keep, threads)
     else:
-        rows, undetermined, factor = kernel.solve(*sides, noise(gram) if check else 0.0, keep)
+        rows, undetermined, factor = _solved_by_library(*sides, row_chunk, keep, check)
     if bool(undetermined.any()):
         for name, values in (("descriptors", gram), ("lmbda and eigenvalues", diagonal)):
             if not bool(torch.isfinite(values).all()):
@@ -83,9 +85,24 @@ def solved_rows(
     return rows.reshape(rhs.shape), factor
 
 
-def _factor_shape(like: Tensor, n: int, ky: int, kx: int) -> tuple[int, ...]:
+def is_packed(like: Tensor) -> bool:
+    """Whether our kernel solves for tensors like this one.
+
+    An argument of the operators: what ``torch.compile`` keeps on the disk must not be taken where it is otherwise,
+    since the factors differ in shape.
+    """
+    return kernel_for(like.device, like.dtype) is not None
+
+
+def _kernel(like: Tensor) -> Kernel:
     kernel = kernel_for(like.device, like.dtype)
-    return (ky, n, kx, kx) if kernel is None else kernel.factor_shape(n, ky, kx)
+    if kernel is None:
+        raise ValueError(f"rows of {like.dtype} on {like.device}: asked of a kernel that is not here")
+    return kernel
+
+
+def _factor_shape(like: Tensor, n: int, ky: int, kx: int, packed: bool) -> tuple[int, ...]:
+    return _kernel(like).factor_shape(n, ky, kx) if packed else (ky, n, kx, kx)
 
 
 def _solved_by_library(
@@ -136,14 +153,11 @@ def _solve_rows_again(rhs: Tensor, factor: Tensor) -> Tensor:
     ky, kx = rhs.shape[-2:]
     if rhs.numel() == 0:
         return rhs.clone()
-    if _is_packed(factor):
-        kernel = kernel_for(factor.device, factor.dtype)
-        if kernel is None:
-            raise ValueError("factor: made by a kernel that is not here any more")
-        return kernel.solve_again(factor, rhs.reshape(-1, ky, kx)).reshape(rhs.shape)
+    if _holds_packed(factor):
+        return _kernel(factor).solve_again(factor, rhs.reshape(-1, ky, kx)).reshape(rhs.shape)
     n = factor.shape[1]
-    right = rhs.reshape(n, ky, kx).transpose(0, 1)[:, :, None]
-    rows = rhs.new_empty(ky, n, kx)
+    right = rhs.to(factor.dtype).reshape(n, ky, kx).transpose(0, 1)[:, :, None]
+    rows = factor.new_empty(ky, n, kx)
 
     def solve(parts: Sequence[slice]) -> None:  # what the first sweep of a part has read, the second finds in the cache
         for part in parts:
@@ -153,19 +167,21 @@ def _solve_rows_again(rhs: Tensor, factor: Tensor) -> Tensor:
     return rows.transpose(0, 1).reshape(rhs.shape).contiguous()
 
 
-def _is_packed(factor: Tensor) -> bool:
+def _holds_packed(factor: Tensor) -> bool:
     return factor.ndim == 3
 
 
 @torch.library.register_fake("torchqm::solve_rows")
-def _(gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool, check: bool) -> tuple[Tensor, Tensor]:
-    ky, kx = rhs.shape[-2:]
-    return rhs.new_empty(rhs.shape), rhs.new_empty(_factor_shape(gram, prod(rhs.shape[:-2]), ky, kx) if keep else 0)
+def _(
+    gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool, check: bool, packed: bool
+) -> tuple[Tensor, Tensor]:
+    (ky, kx), n = rhs.shape[-2:], prod(rhs.shape[:-2])
+    return gram.new_empty(rhs.shape), gram.new_empty(_factor_shape(gram, n, ky, kx, packed) if keep else 0)
 
 
 @torch.library.register_fake("torchqm::solve_rows_again")
 def _(rhs: Tensor, factor: Tensor) -> Tensor:
-    return rhs.new_empty(rhs.shape)
+    return factor.new_empty(rhs.shape)
 
 
 def _to_front(size: int, tensors: Sequence[Tensor], in_dims: Sequence[int | None]) -> list[Tensor]:
@@ -176,13 +192,21 @@ def _to_front(size: int, tensors: Sequence[Tensor], in_dims: Sequence[int | None
 
 @torch.library.register_vmap("torchqm::solve_rows")
 def _(
-    info: Any, in_dims: Any, gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool, check: bool
+    info: Any,
+    in_dims: Any,
+    gram: Tensor,
+    diagonal: Tensor,
+    rhs: Tensor,
+    row_chunk: int,
+    keep: bool,
+    check: bool,
+    packed: bool,
 ) -> tuple[tuple[Tensor, Tensor], tuple[int, int | None]]:
     front = _to_front(info.batch_size, (gram, diagonal, rhs), in_dims[:3])
-    rows, factor = torch.ops.torchqm.solve_rows(*front, row_chunk, keep, check)
+    rows, factor = torch.ops.torchqm.solve_rows(*front, row_chunk, keep, check, packed)
     if not keep:
         return (rows, factor), (0, None)
-    samples = 0 if _is_packed(factor) else 1
+    samples = 0 if _holds_packed(factor) else 1
     return (rows, factor.unflatten(samples, (info.batch_size, -1))), (0, samples)
 
 

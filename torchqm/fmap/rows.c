@@ -21,16 +21,22 @@ EXPORT int tile(void) { return TILE; }
 #define SQRT sqrtf
 #define LARGEST FLT_MAX
 #define NAME(x) x##_float
+#define BODY(x) x##_float_body
+#define VERSIONS_OF(x) VERSIONS(x##_float)
 #include "rows_kernel.h"
 #undef REAL
 #undef LANES
 #undef SQRT
 #undef LARGEST
 #undef NAME
+#undef BODY
+#undef VERSIONS_OF
 
 #define REAL double
 #define LANES (BYTES / (int)sizeof(double))
 #define SQRT sqrt
 #define LARGEST DBL_MAX
 #define NAME(x) x##_double
+#define BODY(x) x##_double_body
+#define VERSIONS_OF(x) VERSIONS(x##_double)
 #include "rows_kernel.h"

@@ -11,12 +11,10 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch._C._functorch import TransformType
-from torch._functorch.pyfunctorch import retrieve_all_functorch_interpreters
 from torch.autograd.forward_ad import unpack_dual
 
 from torchqm.checks import Sizes, enabled, wanted
-from torchqm.fmap.row_operators import UndeterminedRowsError, solved_rows
+from torchqm.fmap.row_operators import UndeterminedRowsError, is_packed, solved_rows
 
 __all__ = ["UndeterminedRowsError", "solve_rows"]
 
@@ -39,7 +37,8 @@ def solve_rows(
         diagonal: ``(..., Ky, Kx)`` added to the diagonal of ``gram``, for each row.
         rhs: ``(..., Ky, Kx)`` right-hand sides.
         row_chunk: keep no factor, and let at most so many rows of all samples be in memory at once: ``(..., row_chunk,
-            Kx, Kx)`` numbers. The backward pass then factors again, chunk by chunk. None: keep the factor.
+            Kx, Kx)`` numbers (the compiled kernel: rounded up to 4 or 8 rows of one sample). The backward pass then
+            factors again, chunk by chunk. None: keep the factor.
 
     Returns:
         ``(..., Ky, Kx)``.
@@ -66,7 +65,7 @@ def solve_rows(
     if enabled() and not tracked and _plain(gram, diagonal, rhs):
         # Nobody differentiates either. Called as an operator for the first time, it would load the
         # compiler, which takes longer than the match of a pair.
-        return solved_rows(gram, diagonal, rhs, row_chunk or 0, False, True)[0]
+        return solved_rows(gram, diagonal, rhs, row_chunk or 0, False, True, is_packed(gram))[0]
     return _solver().apply(gram, diagonal, rhs, row_chunk or 0, keep, wanted())[0]
 
 
@@ -99,7 +98,7 @@ class _Solve(torch.autograd.Function):
     def forward(
         gram: Tensor, diagonal: Tensor, rhs: Tensor, row_chunk: int, keep: bool, check: bool
     ) -> tuple[Tensor, Tensor]:
-        return torch.ops.torchqm.solve_rows(gram, diagonal, rhs, row_chunk, keep, check)
+        return torch.ops.torchqm.solve_rows(gram, diagonal, rhs, row_chunk, keep, check, is_packed(gram))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
@@ -164,6 +163,9 @@ class _SolveAgainForward(_SolveAgain):
 
 def _moved(rows: Tensor, gram: Tensor | None, diagonal: Tensor | None, rhs: Tensor | None) -> Tensor:
     """Right-hand sides of the rows' tangents: ``S_i dc_i = drhs_i - (dgram + diag(ddiagonal_i)) c_i``."""
+    from torch._C._functorch import TransformType
+    from torch._functorch.pyfunctorch import retrieve_all_functorch_interpreters
+
     if sum(level.key() == TransformType.Jvp for level in retrieve_all_functorch_interpreters()) > 1:
         # What torch gives for the second derivatives of any autograd.Function in this mode is zero, or wrong.
         raise NotImplementedError("solve_rows has no derivatives forward over forward; take them forward over reverse")

@@ -157,7 +157,7 @@ typedef struct {
     int failed;
 } NAME(task);
 
-CLONES static void NAME(solve_groups)(void *given) {
+INLINE void BODY(solve_groups)(void *given) {
     NAME(task) *t = given;
     const int64_t k = t->k, ky = t->ky, padded = (k + TILE - 1) / TILE * TILE, groups = (ky + LANES - 1) / LANES;
     const int64_t size = NAME(start)(padded / TILE);
@@ -179,7 +179,9 @@ CLONES static void NAME(solve_groups)(void *given) {
     free(space);
 }
 
-CLONES static void NAME(solve_groups_again)(void *given) {
+VERSIONS_OF(solve_groups)
+
+INLINE void BODY(solve_groups_again)(void *given) {
     NAME(task) *t = given;
     const int64_t k = t->k, ky = t->ky, padded = (k + TILE - 1) / TILE * TILE, groups = (ky + LANES - 1) / LANES;
     VEC *x = malloc(sizeof(VEC) * padded);
@@ -192,6 +194,8 @@ CLONES static void NAME(solve_groups_again)(void *given) {
     }
     free(x);
 }
+
+VERSIONS_OF(solve_groups_again)
 
 /* Row i of sample b solves (gram_b + diag(diagonal_bi)) x = rhs_bi. Returns 0, or 1 where there is no memory.
  *

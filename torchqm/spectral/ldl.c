@@ -38,7 +38,7 @@ INLINE void solve(const task *t, vec *x) {
     }
 }
 
-CLONES static void parts(void *given) {
+INLINE void parts_body(void *given) {
     task *t = given;
     vec *x = t->spaces + 2 * t->n * take(&t->free_space), *before = x + t->n;
     for (int64_t part; (part = take(&t->next)) * WIDTH < t->rows;) {
@@ -58,6 +58,8 @@ CLONES static void parts(void *given) {
             for (int64_t i = 0; i < t->n; i++) to[l * t->n + i] = x[i][l];
     }
 }
+
+VERSIONS(parts)
 
 /* Rows (rows, n) become ((L D L^T)^-1 - centre)^times of them. spaces: 2 * WIDTH * n numbers for each thread. */
 EXPORT void apply(int64_t n, const int64_t *starts, const int32_t *indices, const double *entries, const double *inverse,

@@ -44,7 +44,7 @@ INLINE void dots(const double *rows, int64_t count, const double *few, int64_t n
         }
 }
 
-CLONES static void project_parts(void *given) {
+INLINE void project_parts_body(void *given) {
     task *t = given;
     for (int64_t part; (part = take(&t->next)) * PART < t->n;) {
         double *products = t->products + part * t->m * FEW;
@@ -57,6 +57,8 @@ CLONES static void project_parts(void *given) {
                          end - c < WIDE ? end - c : WIDE, products + i * FEW + j);
     }
 }
+
+VERSIONS(project_parts)
 
 /* few -= products^T rows for `count` rows (at most 8) and some columns. */
 INLINE void minus(const double *rows, int64_t count, double *few, int64_t n, int64_t columns, const double *products) {
@@ -82,7 +84,7 @@ INLINE void minus(const double *rows, int64_t count, double *few, int64_t n, int
         }
 }
 
-CLONES static void subtract_parts(void *given) {
+INLINE void subtract_parts_body(void *given) {
     task *t = given;
     for (int64_t part; (part = take(&t->next)) * NARROW < t->n;) {
         const int64_t c = part * NARROW, columns = t->n - c < NARROW ? t->n - c : NARROW;
@@ -90,6 +92,8 @@ CLONES static void subtract_parts(void *given) {
             minus(t->rows + i * t->n + c, t->m - i < 8 ? t->m - i : 8, t->few + c, t->n, columns, t->products + i * FEW);
     }
 }
+
+VERSIONS(subtract_parts)
 
 /* Parts that products are summed up in; in this order, however many threads there are. */
 EXPORT int64_t parts(int64_t n) { return (n + PART - 1) / PART; }

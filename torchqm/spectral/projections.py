@@ -23,10 +23,11 @@ def project(vectors: Tensor, rows: Tensor) -> Tensor:
         return vectors @ rows.T
     (m, n), b, few = vectors.shape, rows.shape[0], ours.few()
     space = torch.empty(ours.parts(n) * m * few, dtype=torch.float64)
+    threads = min(torch.get_num_threads(), ours.parts(n))
     products = torch.empty(m, b, dtype=torch.float64)
     for begin in range(0, b, few):
         some = rows[begin : begin + few]
-        ours.project(m, n, vectors.data_ptr(), some.data_ptr(), torch.get_num_threads(), space.data_ptr())
+        ours.project(m, n, vectors.data_ptr(), some.data_ptr(), threads, space.data_ptr())
         products[:, begin : begin + few] = space[: m * few].view(m, few)
     return products
 
@@ -38,13 +39,16 @@ def subtract_(rows: Tensor, vectors: Tensor, products: Tensor) -> Tensor:
         >>> subtract_(torch.ones(1, 2), torch.eye(2), torch.tensor([[1.0], [3.0]])).tolist()
         [[0.0, -2.0]]
     """
-    ours = _ours(vectors, rows)
+    if products.shape != (vectors.shape[0], rows.shape[0]):
+        raise ValueError(f"products: {tuple(products.shape)} given, {(vectors.shape[0], rows.shape[0])} expected")
+    ours = _ours(vectors, rows, products)
     if ours is None:
         return rows.addmm_(products.T, vectors, alpha=-1)
     (m, n), b, few = vectors.shape, rows.shape[0], ours.few()
+    threads = min(torch.get_num_threads(), ours.parts(n))
     for begin in range(0, b, few):
         some, factors = rows[begin : begin + few], products[:, begin : begin + few].contiguous()
-        ours.subtract(m, n, vectors.data_ptr(), some.data_ptr(), torch.get_num_threads(), factors.data_ptr())
+        ours.subtract(m, n, vectors.data_ptr(), some.data_ptr(), threads, factors.data_ptr())
     return rows
 
 
@@ -56,13 +60,17 @@ def for_products(vectors: Tensor) -> Tensor:
     return vectors
 
 
-def _ours(vectors: Tensor, rows: Tensor) -> ctypes.CDLL | None:
+def _ours(vectors: Tensor, rows: Tensor, *more: Tensor) -> ctypes.CDLL | None:
     """The library, where it can be used for these."""
     built = _built()
-    if built is None or rows.shape[0] % built.few():
+    if built is None or rows.shape[0] % built.few() or vectors.shape[1] != rows.shape[1]:
         return None
-    fits = all(t.device.type == "cpu" and t.dtype == torch.float64 and t.is_contiguous() for t in (vectors, rows))
-    return built if fits and rows.numel() and vectors.numel() else None
+    fits = all(
+        t.device.type == "cpu" and t.dtype == torch.float64 and not t.is_neg() and not t.requires_grad
+        for t in (vectors, rows, *more)
+    )
+    whole = vectors.is_contiguous() and rows.is_contiguous()
+    return built if fits and whole and rows.numel() and vectors.numel() else None
 
 
 @cache

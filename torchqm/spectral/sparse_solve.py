@@ -6,6 +6,8 @@ makes the factor, and they work in its order of the vertices: whole runs stay in
 
 import ctypes
 from abc import ABC, abstractmethod
+from importlib.util import find_spec
+from threading import Lock
 
 import numpy as np
 import scipy
@@ -44,7 +46,8 @@ def factorize(matrix: "scipy.sparse.csc_array", shift: float, device: torch.devi
     """
     shifted = scipy.sparse.csc_array(matrix + shift * scipy.sparse.eye_array(matrix.shape[0], format="csc"))
     shifted.sort_indices()
-    built = library("spectral/_ldl") if device.type == "cpu" else None
+    there = device.type == "cpu" and find_spec("qdldl") is not None
+    built = library("spectral/_ldl") if there else None
     return _Cholespy(shifted, device) if built is None else _Ours(shifted, built)
 
 
@@ -60,7 +63,7 @@ class _Ours(Factor):
             raise FactorError(f"no Cholesky factor: {error}") from error
         if not (diagonal > 0).all():
             raise FactorError(f"no Cholesky factor: {int((~(diagonal > 0)).sum())} pivots are not positive")
-        self.order = order
+        self.order, self._n = order, matrix.shape[0]
         # Kept as long as their addresses are used.
         self._lower = (lower.indptr.astype(np.int64), lower.indices.astype(np.int32), lower.data, 1 / diagonal)
         self._apply, self._width = built.apply, built.width()
@@ -68,18 +71,21 @@ class _Ours(Factor):
         integer = ctypes.c_int
         self._apply.argtypes = [size, at, at, at, at, size, at, at, ctypes.c_double, integer, integer, at]
         self._apply.restype = None
-        self._spaces = torch.empty(0, dtype=torch.float64)
+        self._spaces, self._lock = torch.empty(0, dtype=torch.float64), Lock()
 
     def filtered(self, rows: Tensor, centre: float = 0.0, times: int = 1) -> Tensor:
-        rows = rows.contiguous()
-        m, n = rows.shape
+        if rows.ndim != 2 or rows.shape[1] != self._n or rows.dtype != torch.float64 or rows.device.type != "cpu":
+            given = f"{tuple(rows.shape)}, {rows.dtype} on {rows.device}"
+            raise ValueError(f"rows: {given} given, expected (m, {self._n}), torch.float64 on cpu")
+        rows, m = rows.resolve_neg().contiguous(), rows.shape[0]
         threads = max(1, min(torch.get_num_threads(), -(-m // self._width)))
-        if self._spaces.numel() < threads * 2 * self._width * n:
-            self._spaces = torch.empty(threads * 2 * self._width * n, dtype=torch.float64)
         found = torch.empty_like(rows)
         factor = [array.ctypes.data for array in self._lower]
         where = (rows.data_ptr(), found.data_ptr())
-        self._apply(n, *factor, m, *where, centre, times, threads, self._spaces.data_ptr())
+        with self._lock:  # of the space that its calls share: memory that is new each time takes longer than the sweeps
+            if self._spaces.numel() < threads * 2 * self._width * self._n:
+                self._spaces = torch.empty(threads * 2 * self._width * self._n, dtype=torch.float64)
+            self._apply(self._n, *factor, m, *where, centre, times, threads, self._spaces.data_ptr())
         return found
 
 
