@@ -1,8 +1,8 @@
 """Finds what was built from our C files, if it was, and lets it share torch's threads.
 
-``pip install`` builds them where there is a C compiler with GCC's vector types: GCC, or Clang, whose code for the rows of
-functional maps takes twice as long. Without them other libraries do the same work in several times as long. ``torchqm --version``
-says which are there. After a change of a C file they have to be installed anew.
+``pip install`` builds them where there is a C compiler with GCC's vector types: GCC, or Clang, whose code for the rows
+of functional maps takes twice as long. Without them other libraries do the same work in several times as long.
+``torchqm --version`` says which are there. After a change of a C file they have to be installed anew.
 """
 
 import ctypes
