@@ -309,6 +309,15 @@ def learning(data: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def startup(data: dict[str, Any]) -> str:
+    """What the package adds to torch's own start."""
+    added, help_ = (data["goals"][name]["wall_s"] for name in ("import torchqm, torch", "torchqm --help"))
+    return (
+        f"Start-up, `{data['command']}`: `import torchqm` takes {added:.2f} s beyond `import torch`, "
+        f"`torchqm --help` {help_:.2f} s."
+    )
+
+
 def layers(data: dict[str, Any]) -> str:
     """Time and memory of the layers."""
     solver, blocks, basis, soft = (data[part] for part in ("solver", "blocks", "basis", "soft_map"))
@@ -423,6 +432,7 @@ def main() -> int:
         "speed_match": whole_pair,
         "speed_growth": growth,
         "speed_geodesics": geodesics,
+        "startup": startup,
         "learning": learning,
     }
     for name, make in single.items():
