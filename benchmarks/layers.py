@@ -29,6 +29,7 @@ from layers_basis import basis_part
 from layers_soft import soft_map_part
 from torch import Tensor
 
+from torchqm.fmap.compiled import SPARE
 from torchqm.fmap.regularized import regularized_blocks, regularized_fmap
 from torchqm.nn.solver import FunctionalMapSolver
 
@@ -128,6 +129,7 @@ def one_peak(case: str) -> float:
     name, features = case.split(":")
     step = steps(K, bool(int(features)))[name]
     step()
+    SPARE.clear()  # what is kept for the next step counts, too
     gc.collect()
     ctypes.CDLL("libc.so.6").malloc_trim(0)  # what the first step has freed goes back to the system
     before = _status_mib("VmRSS")

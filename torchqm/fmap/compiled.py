@@ -11,16 +11,18 @@ from math import prod
 import torch
 from torch import Tensor
 
+from torchqm.fmap.spare import SpareMemory
 from torchqm.native import library
 
-__all__ = ["KERNELS", "Kernel", "kernel_for"]
+__all__ = ["KERNELS", "SPARE", "Kernel", "kernel_for"]
 
 _NAMES = {torch.float32: ("float", ctypes.c_float), torch.float64: ("double", ctypes.c_double)}
 # Numbers in the factors of a call from which on several threads gain more than they cost, in a solve that
 # has them and in one that makes them. Measured.
 _WORTH_THREADS = {"again": 2**23, "anew": 2**19}
-# Bytes from which on large pages pay, where malloc has given memory back to the system and gets it anew.
-_LARGE = 2**22
+
+SPARE = SpareMemory(2**26)
+"""For factors of up to half of this; larger ones are asked for in large pages."""
 
 
 class Kernel:
@@ -67,9 +69,7 @@ class Kernel:
             raise ValueError(f"gram, diagonal, rhs: shapes {shapes} given, which do not fit")
         gram, diagonal, rhs = self._plain("gram", gram), self._plain("diagonal", diagonal), self._plain("rhs", rhs)
         shape = self.factor_shape(n, ky, kx)
-        factor = rhs.new_empty(shape if keep else 0)
-        if factor.nbytes >= _LARGE:
-            self._large_pages(factor.data_ptr(), factor.nbytes)
+        factor = self._room(shape) if keep else rhs.new_empty(0)
         rows, fine = torch.empty_like(rhs), torch.empty(n, ky, dtype=torch.bool, device=rhs.device)
         given = [tensor.data_ptr() for tensor in (gram, diagonal, rhs)]
         made = rows.data_ptr(), factor.data_ptr() if keep else None, fine.data_ptr()
@@ -89,6 +89,15 @@ class Kernel:
         worth = threads if factor.numel() >= _WORTH_THREADS["again"] else 1
         _succeed(self._again(factor.data_ptr(), rhs.data_ptr(), n, kx, ky, worth, rows.data_ptr()))
         return rows
+
+    def _room(self, shape: tuple[int, int, int]) -> Tensor:
+        """Memory for factors."""
+        size = prod(shape) * self.dtype.itemsize
+        if size <= SPARE.limit // 2:
+            return SPARE.empty(shape, self.dtype)
+        room = torch.empty(shape, dtype=self.dtype, device="cpu")
+        self._large_pages(room.data_ptr(), size)
+        return room
 
     def _plain(self, name: str, tensor: Tensor) -> Tensor:
         """As C reads it."""
