@@ -109,7 +109,8 @@ def p2p_to_fmap(p2p_yx: Int[Tensor, " Vy"], basis_x: SpectralBasis, basis_y: Spe
     if p2p_yx.shape[0] != basis_y.n_verts:
         raise ValueError(f"p2p_yx has {p2p_yx.shape[0]} entries, but y has {basis_y.n_verts} vertices")
     # By blocks, so that the functions pulled back never exist at all vertices.
-    parts = zip(basis_y.evecs.split(_ROWS), basis_y.mass.split(_ROWS), p2p_yx.split(_ROWS), strict=True)
+    rows = torch.as_tensor(p2p_yx).split(_ROWS)
+    parts = zip(basis_y.evecs.split(_ROWS), basis_y.mass.split(_ROWS), rows, strict=True)
     blocks = [(SpectralBasis(basis_y.evals, evecs, mass), ids) for evecs, mass, ids in parts]
     return torch.stack(in_parallel([partial(_pulled_back, basis_x, block, ids) for block, ids in blocks])).sum(0)
 

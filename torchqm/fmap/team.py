@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from contextvars import Context, copy_context
 from threading import Condition, Thread
 from typing import Any
@@ -27,7 +28,7 @@ class _Job:
         self.grad, self.inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
     def run(self, number: int) -> None:
-        """Run a task as the caller would: its context, its gradients."""
+        """Run a task as the caller: its context, its gradients; autocast and default devices are a thread's own."""
         try:
             with torch.inference_mode(self.inference), torch.set_grad_enabled(self.grad):
                 self.results[number] = self.contexts[number].run(self.tasks[number])
@@ -59,27 +60,46 @@ class Team:
         Only threads at work for the team may call this: the one that made it, and tasks.
         """
         job = _Job(tasks)
-        with self._changed:
+        self._changed.acquire()
+        try:
             self._jobs.append(job)
-            while len(self._helpers) < min(self.size - 1, len(tasks) - 1):
-                self._helpers.append(Thread(target=self._help))
-                self._helpers[-1].start()
+            self._hire(min(self.size - 1, len(tasks) - 1))
             self._changed.notify_all()
-            try:
-                self._serve(job)
-            finally:
+            self._serve(job)
+        finally:
+            # An interrupt can come while the lock is taken or given away.
+            if job in self._jobs:
                 self._jobs.remove(job)
+            self._let_go()
         if job.errors:
-            raise job.errors[min(job.errors)]
+            # What asks the process to end comes before what went wrong in it.
+            raise job.errors[min(job.errors, key=lambda number: (isinstance(job.errors[number], Exception), number))]
         return [job.results[number] for number in range(len(tasks))]
 
-    def close(self) -> None:
-        """End the helpers."""
+    def close(self, wait: bool = True) -> None:
+        """End the helpers, and wait for them unless the caller has been interrupted: they may be at a long task."""
+        self._closed = True
         with self._changed:
-            self._closed = True
             self._changed.notify_all()
-        for helper in self._helpers:
+        self._let_go()
+        for helper in self._helpers if wait else ():
             helper.join()
+
+    def _hire(self, n: int) -> None:
+        """Have n helpers; fewer where the system gives no more threads: whoever has tasks can do them alone."""
+        while len(self._helpers) < n:
+            helper = Thread(target=self._help, daemon=True)
+            try:
+                helper.start()
+            except RuntimeError:
+                return
+            self._helpers.append(helper)
+
+    def _let_go(self) -> None:
+        """Give the lock away, as often as this thread has it."""
+        with suppress(RuntimeError):
+            while True:
+                self._changed.release()
 
     def _help(self) -> None:
         torch.set_num_threads(1)
@@ -105,6 +125,9 @@ class Team:
                 job.waiting.clear()
             if not job.left:
                 self._changed.notify_all()
+            error = job.errors.get(number)
+            if mine is not None and error is not None and not isinstance(error, Exception):
+                raise error  # an interrupt: what others are at is left to itself
 
     def _next(self, mine: _Job | None) -> _Job | None:
         """A job with tasks that nobody has begun: the own one first, else the newest, which may be a part of it."""

@@ -84,19 +84,28 @@ def one_thread() -> Iterator[None]:
     team = Team(before)
     tokens = _TEAM.set(team), _BEFORE.set(before)
     torch.set_num_threads(1)
+    patient = False
     try:
         yield
+        patient = True
+    except Exception:
+        patient = True
+        raise
     finally:
-        team.close()
-        _BLAS.give_back()
-        torch.set_num_threads(before)
-        _TEAM.reset(tokens[0])
-        _BEFORE.reset(tokens[1])
+        try:
+            team.close(patient)
+        finally:
+            _BLAS.give_back()
+            torch.set_num_threads(before)
+            _TEAM.reset(tokens[0])
+            _BEFORE.reset(tokens[1])
 
 
 @contextmanager
 def threads_as_before() -> Iterator[None]:
     """Inside :func:`one_thread`, run the body as if outside of it: for what others wrote, such as a network.
+
+    Not for several tasks at the same time.
 
     Example:
         >>> before = torch.get_num_threads()

@@ -1,6 +1,7 @@
 """Some poses of one shape: each prepared once, its symmetry found once, any two matched (paper, section 6.2)."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -33,8 +34,9 @@ from torchqm.spectral.cache import is_cached
 
 __all__ = ["METHODS", "SYMMETRIES", "Collection"]
 
-# Vertices of two shapes whose eigenpairs are computed at the same time, each with half a gigabyte at most.
-_TOGETHER = 120_000
+# Vertices times eigenpairs of a shape whose eigenpairs one thread computes, those of two such shapes at the same
+# time: products of one are bound by memory, and each takes half a gigabyte (54,000 vertices, 216 pairs: 1.2 for both).
+_SMALL = 15_000_000
 
 METHODS = ("quotient", "paper", "semi")
 
@@ -108,25 +110,32 @@ class Collection:
         return self._shapes[id(mesh)][1]
 
     def _prepared(self, mesh: Mesh) -> PreparedShape:
+        """With its eigenpairs; those of small shapes always by one thread, so that all runs give the same digits."""
         p = self.parameters
-        return prepare(mesh, p.k_max, max(p.n_samples, N_ANCHORS), p.seed, cache_dir=self.cache_dir)
+        with one_thread() if self._is_small(mesh) else nullcontext():
+            return prepare(mesh, p.k_max, max(p.n_samples, N_ANCHORS), p.seed, cache_dir=self.cache_dir)
+
+    def _is_small(self, mesh: Mesh) -> bool:
+        return mesh.n_verts * self.parameters.k_max <= _SMALL
 
     def _read(self, *meshes: Mesh | PreparedShape) -> None:
-        """Make several meshes ready at the same time: read from the cache, or computed where memory allows it."""
+        """Make several meshes ready at the same time: read from the cache, or computed where they are small."""
         new = [m for m in dict.fromkeys(meshes) if isinstance(m, Mesh) and id(m) not in self._shapes]
-        # Products of one run are bound by memory, so on few cores two runs do not take twice as long as one.
-        few = sum(m.n_verts for m in new) <= _TOGETHER and torch.get_num_threads() <= 2 * len(new)
-        if len(new) < 2:
+        if len(new) < 2 or torch.get_num_threads() < 2:
             return
-        if not few and not all(is_cached(m, self.parameters.k_max, cache_dir=self.cache_dir) for m in new):
+        if not all(map(self._is_small, new)) and not all(
+            is_cached(m, self.parameters.k_max, cache_dir=self.cache_dir) for m in new
+        ):
             return
-        prepared: list[PreparedShape] = []
+
+        def ready(mesh: Mesh) -> None:
+            self._shapes[id(mesh)] = (mesh, self._prepared(mesh))
+
         for number, mesh in enumerate(new):
             with self.steps(f"eigenpairs of {mesh.name}", COST["eigenpairs"] * mesh.n_verts / 1000):
-                if not prepared:
+                if number == 0:  # and of the others
                     with one_thread():
-                        prepared = in_parallel([partial(self._prepared, m) for m in new])
-            self._shapes[id(mesh)] = (mesh, prepared[number])
+                        in_parallel([partial(ready, m) for m in new])
 
     def symmetry(self, shape: PreparedShape, how: str = "extrinsic") -> KnownSymmetry:
         """The shape's symmetry: from the reference if there is one, else from itself.
