@@ -96,7 +96,9 @@ def cotan_matrix(verts: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> "sci
     n = verts.shape[0]
     weight = _half_cotangents(verts.detach(), faces).reshape(-1).numpy()
     rows, cols = (faces[:, corners].reshape(-1).to(torch.int32).numpy() for corners in ([1, 2, 0], [2, 0, 1]))
-    diagonal, ids = np.bincount(rows, weight, n) + np.bincount(cols, weight, n), np.arange(n, dtype=np.int32)
+    # One sum in the order that torch adds in: the last digits decide between candidates that fit equally well.
+    diagonal = np.bincount(np.concatenate([rows, cols]), np.concatenate([weight, weight]), n)
+    ids = np.arange(n, dtype=np.int32)
     entries = np.concatenate([-weight, -weight, diagonal])
     places = np.concatenate([rows, cols, ids]), np.concatenate([cols, rows, ids])
     return scipy.sparse.coo_array((entries, places), shape=(n, n)).tocsr()
