@@ -215,7 +215,7 @@ def test_the_matrix_for_scipy_is_the_same(faces):
 
 def test_the_matrix_for_scipy_is_the_same_to_the_last_bit():
     """Its last digits have decided which of two maps of equal quality was returned."""
-    ball = sphere()
+    ball = sphere(5)  # torch adds in no certain order where there are few entries
     verts = ball.verts + 0.1 * torch.randn(ball.verts.shape, generator=torch.Generator().manual_seed(0)).double()
     found, slow = cotan_matrix(verts, ball.faces), to_scipy(cotan_stiffness(verts, ball.faces))
-    assert np.array_equal(found.toarray(), slow.toarray())
+    assert (found != slow).nnz == 0
