@@ -2,12 +2,14 @@ import pytest
 import torch
 from references.pairs import K, with_loose_vertices
 from references.shapes import basis_of, blob, grid
+from threadpoolctl import threadpool_limits
 
 import torchqm.matching.shape as module
+from torchqm.data.synthetic import creature
 from torchqm.fmap import nearest_rows
 from torchqm.geometry import Mesh, area_samples
 from torchqm.matching import prepare
-from torchqm.spectral import SpectrumError
+from torchqm.spectral import SpectralBasis, SpectrumError
 from torchqm.testing import basis_allclose
 
 
@@ -168,3 +170,18 @@ def test_search_needs_its_anchors(mesh, monkeypatch):
     assert prepare(mesh, 5, n_samples=100).search is None
     monkeypatch.setattr(module, "N_ANCHORS", 400)
     assert prepare(mesh, 5).search is None  # 642 < 800
+
+
+def test_curvature_does_not_depend_on_the_number_of_threads():
+    """Large enough for BLAS to divide its sums."""
+    mesh, before, found = creature("quadruped", 12000).mesh, torch.get_num_threads(), []
+    area = mesh.normalized().vertex_areas
+    basis = SpectralBasis(torch.zeros(1).double(), torch.ones(mesh.n_verts, 1).double(), area)
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            with threadpool_limits(threads, "blas"):
+                found.append(prepare(mesh, 1, basis=basis).curvature)
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(*found)

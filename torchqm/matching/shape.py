@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchqm.fmap.surface_search import SurfaceSearch
-from torchqm.fmap.threads import in_parallel
+from torchqm.fmap.threads import in_parallel, one_thread
 from torchqm.geometry.check import MeshReport, clean_faces, inspect_mesh, orient_faces
 from torchqm.geometry.laplacian import laplacian
 from torchqm.geometry.mesh import Mesh
@@ -70,7 +70,8 @@ class PreparedShape:
 
 
 def _curvature(shape: PreparedShape) -> Float[Tensor, " V"]:
-    return smooth_curvature(shape.mesh)
+    with one_thread():  # sums of several threads have other last digits, and then other steps are the last ones
+        return smooth_curvature(shape.mesh)
 
 
 def _search(shape: PreparedShape) -> SurfaceSearch | None:
