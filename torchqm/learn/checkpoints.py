@@ -27,9 +27,9 @@ def find_weights(path: str | Path) -> Path:
     """The file that a network is read from: the path itself, the best checkpoint of a run folder, or its last.
 
     Which one scored best is what the checkpoints remember, whatever they are called: of those that remember one that is
-    still there, the one of the largest step. If callbacks in it disagree, that of the options ``checkpoint`` counts, with
-    a warning. Where no checkpoint remembers any, it is the last by name of those called ``best``, else ``last``, else of
-    all, with a warning if there are several.
+    still there, the one of the largest step. If callbacks in it disagree, that of the options ``checkpoint`` counts,
+    with a warning. Where no checkpoint remembers any, it is the last by name of those called ``best``, else ``last``,
+    else of all, with a warning if there are several.
 
     Raises:
         ValueError: there is nothing, or no checkpoint in the folder.
