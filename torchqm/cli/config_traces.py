@@ -10,12 +10,12 @@ __all__ = ["causes", "group_made", "modules", "objects_made"]
 def causes(error: BaseException) -> list[BaseException]:
     """The error, and what is behind it where jsonargparse raised it, the first error of other code last."""
     frames = _frames(error)
-    if not frames or not _module(frames[-1]).startswith("jsonargparse."):
+    if not _is_parsers(error):
         return [error]
     # It tried several kinds, and as cause it keeps the error of the first; they are all where it raised.
     tried = frames[-1].f_locals.get("exceptions", [error.__cause__])
     below = [causes(one) for one in tried if isinstance(one, BaseException)]
-    found = next((path for path in below if not _module(_frames(path[-1])[-1]).startswith("jsonargparse.")), [])
+    found = next((path for path in below if not _is_parsers(path[-1])), [])
     return [error, *found]
 
 
@@ -36,6 +36,11 @@ def group_made(error: BaseException) -> str:
 def modules(error: BaseException) -> list[str]:
     """The modules from where it was caught to where it was raised."""
     return [_module(frame) for one in causes(error) for frame in _frames(one)]
+
+
+def _is_parsers(error: BaseException) -> bool:
+    """Whether jsonargparse raised it."""
+    return any(_module(frame).startswith("jsonargparse.") for frame in _frames(error)[-1:])
 
 
 def _module(frame: FrameType) -> str:
