@@ -54,6 +54,48 @@ def test_without_a_last_one_the_latest_says_which_is_the_best(run, tmp_path):
         assert find_weights(tmp_path) == tmp_path / "b-loss=3.ckpt"  # there is no other
 
 
+def test_the_largest_step_says_which_is_the_best_not_the_last_one(run, tmp_path):
+    """A run that was killed after it kept a better one, before it wrote ``last``."""
+    content = torch.load(run[0] / "checkpoints" / "last.ckpt", weights_only=True)
+    for step, name, best in (
+        (5, "last", "best-epoch=1"),
+        (5, "best-epoch=1", "best-epoch=1"),
+        (9, "z", "best-epoch=1"),
+    ):
+        state = {"best_model_path": f"/elsewhere/{best}.ckpt", "best_model_score": 1.0}
+        torch.save(content | {"global_step": step, "callbacks": {"Best": state}}, tmp_path / f"{name}.ckpt")
+    state = {"best_model_path": "/elsewhere/best-epoch=7.ckpt", "best_model_score": 0.5}
+    with warnings.catch_warnings(action="error"):
+        assert find_weights(tmp_path) == tmp_path / "best-epoch=1.ckpt"
+        torch.save(content | {"global_step": 50, "callbacks": {"Best": state}}, tmp_path / "best-epoch=7.ckpt")
+        assert find_weights(tmp_path) == tmp_path / "best-epoch=7.ckpt"
+        (tmp_path / "z.ckpt").unlink()
+        state["best_model_path"] = "/elsewhere/best-epoch=1.ckpt"  # of one step, what is written last
+        torch.save(content | {"global_step": 50, "callbacks": {"Best": state}}, tmp_path / "last.ckpt")
+        assert find_weights(tmp_path) == tmp_path / "best-epoch=1.ckpt"
+
+
+def test_callbacks_that_disagree_about_the_best_are_told_of(run, tmp_path):
+    content = torch.load(run[0] / "checkpoints" / "last.ckpt", weights_only=True)
+    for name in "abc":
+        torch.save(content | {"callbacks": {}}, tmp_path / f"{name}.ckpt")
+
+    def find(**best):
+        """With states in this order: the name of what each has for the best, and its score."""
+        states = {key: {"best_model_path": f"/x/{name}.ckpt", "best_model_score": v} for key, (name, v) in best.items()}
+        torch.save(content | {"callbacks": states}, tmp_path / "last.ckpt")
+        return find_weights(tmp_path).name
+
+    with pytest.warns(UserWarning, match=r"b\.ckpt: taken as the best; the callbacks of last\.ckpt disagree, ") as w:
+        assert find(Another=("a", 1.0), BestCheckpoint=("b", 2.0), Other=("b", 1.0), Third=("c", 0.0)) == "b.ckpt"
+    assert str(w[0].message).endswith("others have a.ckpt and c.ckpt")
+    with pytest.warns(UserWarning, match=r"disagree"):
+        assert find(Z=("a", 1.0), Y=("c", 1.0)) == "c.ckpt"  # not by their order in the file
+    with warnings.catch_warnings(action="error"):
+        assert find(Every=("a", None), ModelCheckpoint=("b", 2.0)) == "b.ckpt"  # kept by no score
+        assert find(Best=("b", 1.0), Same=("b", 3.0), Gone=("d", 0.0)) == "b.ckpt"
+
+
 def test_bytes_that_changed_in_a_checkpoint_are_noticed(run, tmp_path):
     """Also where the pickle is whole and torch reads it: in the numbers of a weight."""
     content = bytearray((run[0] / "checkpoints" / "last.ckpt").read_bytes())

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from difflib import SequenceMatcher
 
 from torchqm.cli.config_classes import allowed, arguments_of, class_fault
-from torchqm.cli.config_places import files_of, on_one_line, place_of
+from torchqm.cli.config_places import on_one_line, place_of, sources_of
 
 __all__ = ["explained", "nearest_key", "placed"]
 
@@ -28,8 +28,8 @@ def explained(message: str, keys: Sequence[str], args: Sequence[str]) -> str:
         >>> explained('Parser key "model.k": Expected a <class \'int\'>. Got value: ten', ["model.k"], [])
         "model.k: 'ten' given, expected int"
     """
-    files = files_of(args)
-    if faults := [f"{path}: not readable as YAML ({error})" for path, _, error in files if error]:
+    sources = sources_of(args)
+    if faults := [f"{source.place}: not readable as YAML ({source.fault})" for source in sources if source.fault]:
         return faults[0]
     if found := re.search(r"unrecognized arguments: (\S+)", message):
         word = found[1].split("=")[0]
@@ -37,30 +37,28 @@ def explained(message: str, keys: Sequence[str], args: Sequence[str]) -> str:
             return f"{word}: not expected here; options begin with '--'"
         return f"{word}: no such option; {_hint(word.removeprefix('--'), keys, '--')}"
     if found := re.search(r"does not accept option '([^']+)'", message):
-        return f"{place_of(found[1], args, files)}: no such key; {_hint(found[1], keys)}"
+        return f"{place_of(found[1], sources)}: no such key; {_hint(found[1], keys)}"
     head = re.match(r'(?:Parser key|argument) (?:--|")?([\w.]+)"?:', message)
     inner = re.search(r"Problem with given class_path '([^']+)':\s+Option '([^']+)' is not accepted", message)
     if head and inner:
         key = f"{head[1]}.init_args.{inner[2]}"
-        return (
-            f"{place_of(key, args, files)}: {inner[1]} has no such argument; {_hint(inner[2], arguments_of(inner[1]))}"
-        )
+        return f"{place_of(key, sources)}: {inner[1]} has no such argument; {_hint(inner[2], arguments_of(inner[1]))}"
     if found := re.fullmatch(
         r"the following arguments are required: (?:fit\.|test\.|predict\.)?([\w.]+)", message.strip()
     ):
         return f"--{found[1]}: not given, but needed"
     if head and (fault := class_fault(message)):
-        return f"{place_of(head[1], args, files)}: {fault}"
+        return f"{place_of(head[1], sources)}: {fault}"
     key = head[1] if head else ""
     if head and (inside := re.search(_IN_CLASS, message, re.DOTALL)):
         key, message = f"{key}.init_args.{inside[1]}", inside[2]
     expected = allowed(message)
     given = re.search(r"(?:Got value|Given value): (.*)", message, re.DOTALL)
     if head and expected and given:
-        return f"{place_of(key, args, files)}: {on_one_line(given[1])!r} given, expected {expected}"
+        return f"{place_of(key, sources)}: {on_one_line(given[1])!r} given, expected {expected}"
     if head and (rest := on_one_line(message[head.end() :])):
         dashes = "--" if message.startswith("argument --") else ""
-        return f"{dashes + head[1] if dashes else place_of(head[1], args, files)}: {rest}"
+        return f"{dashes + head[1] if dashes else place_of(head[1], sources)}: {rest}"
     return on_one_line(message)
 
 
@@ -83,7 +81,7 @@ def placed(text: str, keys: Sequence[str], args: Sequence[str]) -> str:
         return text
     groups = (found[1],) if found[1] else _GROUPS
     key = next((f"{group}.{found[2]}" for group in groups if f"{group}.{found[2]}" in keys), None)
-    return text if key is None else f"{place_of(key, args, files_of(args))}{text[found.end() :]}"
+    return text if key is None else f"{place_of(key, sources_of(args))}{text[found.end() :]}"
 
 
 def nearest_key(key: str, keys: Sequence[str]) -> str | None:

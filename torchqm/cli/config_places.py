@@ -2,72 +2,77 @@
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Files", "files_of", "given_options", "on_one_line", "place_of"]
-
-Files = Sequence[tuple[Path, dict[str, Any], str]]
-"""YAML files: the path, what is in it by key, and why it cannot be read (empty if it can)."""
+__all__ = ["Source", "given_options", "on_one_line", "place_of", "sources_of"]
 
 _ENDINGS = (".yaml", ".yml", ".json")
 
 
-def files_of(args: Sequence[str]) -> Files:
-    """Each YAML file among the arguments and those that they name: its values, below their group, and its fault.
+@dataclass(frozen=True)
+class Source:
+    """What one argument gives, or one file.
 
     Args:
-        args: ``--config FILE``, ``--model FILE``, ``--model.lr 3`` and so on.
+        values: by key, nested or with dots.
+        place: the path of a file, the option that has a whole config as text; empty: the option of the key itself.
+        fault: why it cannot be read; empty if it can.
     """
-    return list(_files(args))
+
+    values: dict[str, Any]
+    place: str = ""
+    fault: str = ""
 
 
-def place_of(key: str, args: Sequence[str], files: Files) -> str:
-    """The key, after the file that has it; on the command line, which comes last, with its dashes.
+def sources_of(args: Sequence[str]) -> list[Source]:
+    """What the arguments give, in their order: of a key that several have, the last one counts.
+
+    Args:
+        args: ``--config FILE``, ``--config '{model: {lr: 3}}'``, ``--model FILE``, ``--model.lr 3`` and so on. A file
+            that is named in another comes right after it.
+
+    Example:
+        >>> [source.values for source in sources_of(["fit", "--trainer.devices", "{}", "--model.lr=3"])]
+        [{'trainer.devices': {}}, {'model.lr': 3}]
+    """
+    return list(_sources(args))
+
+
+def place_of(key: str, sources: Sequence[Source]) -> str:
+    """The key, after the file that has it, the last of them; on the command line with its dashes.
 
     What belongs to an object, such as ``trainer.callbacks.init_args.mode``, is where the object is.
 
     Example:
-        >>> place_of("model.lr", ["--model.lr", "3"], []), place_of("model.lr", [], [])
+        >>> place_of("model.lr", sources_of(["--model.lr", "3"])), place_of("model.lr", [])
         ('--model.lr', 'model.lr')
     """
     whole = key
     while True:
-        if any(re.fullmatch(rf"--{re.escape(key)}(=.*)?", arg, re.DOTALL) for arg in args):
-            return f"--{whole}"
-        if holders := [path for path, values, _ in files if _has(values, key)]:
-            return f"{holders[-1]}: {whole}"
+        if holders := [source for source in sources if _has(source.values, key)]:
+            place = holders[-1].place
+            return f"{place}: {whole}" if place else f"--{whole}"
         if key.count(".") < 2:  # a group is in a file that need not have this key of it
             return whole
         key = key.rpartition(".")[0]
 
 
-def given_options(args: Sequence[str], files: Files) -> list[tuple[str, Any]]:
+def given_options(sources: Sequence[Source]) -> list[tuple[str, Any]]:
     """The options that somebody gave, each with its value; of a key that is given again the last.
 
-    Of a list of objects each has its options under the same key.
+    Of a list of objects each has its options under the same key, its class before its arguments.
 
     Example:
-        >>> given_options(["--trainer.devices", "{}", "--model.lr=3"], [])
+        >>> given_options(sources_of(["--trainer.devices", "{}", "--model.lr=3"]))
         [('trainer.devices', {}), ('model.lr', 3)]
-        >>> given_options(["--trainer.callbacks", "[{class_path: a.B, init_args: {mode: low}}]"], [])
+        >>> given_options(sources_of(["--trainer.callbacks", "[{class_path: a.B, init_args: {mode: low}}]"]))
         [('trainer.callbacks.class_path', 'a.B'), ('trainer.callbacks.init_args.mode', 'low')]
     """
-    import yaml
-
-    sources = [values for _, values, _ in files]
-    for option, value in zip(args, [*args[1:], ""], strict=False):
-        name, equals, joined = option.partition("=")
-        if not name.startswith("--"):
-            continue
-        text = joined if equals else value
-        try:
-            sources.append({name.removeprefix("--"): yaml.safe_load(text)})
-        except yaml.YAMLError:
-            sources.append({name.removeprefix("--"): text})
     found: list[tuple[str, Any]] = []
-    for values in sources:
-        new = list(_flat("", values))
+    for source in sources:
+        new = list(_flat("", source.values)) if source.values else []
         keys = {key for key, _ in new}
         found = [*((key, value) for key, value in found if key not in keys), *new]
     return found
@@ -80,7 +85,7 @@ def on_one_line(text: str) -> str:
 
 def _flat(key: str, value: Any) -> Iterator[tuple[str, Any]]:
     if isinstance(value, dict) and value:
-        for name, part in value.items():
+        for name, part in sorted(value.items(), key=lambda each: each[0] != "class_path"):
             yield from _flat(f"{key}.{name}" if key else str(name), part)
     elif isinstance(value, list) and any(isinstance(part, dict) for part in value):
         for part in value:
@@ -96,27 +101,63 @@ def _has(values: Any, key: str) -> bool:
     return isinstance(values, dict) and bool(rest) and _has(values.get(first), rest)
 
 
-def _files(args: Sequence[str]) -> Iterator[tuple[Path, dict[str, Any], str]]:
+def _sources(args: Sequence[str]) -> Iterator[Source]:
     for option, value in zip(args, [*args[1:], ""], strict=False):
-        name, _, joined = option.partition("=")
+        name, equals, joined = option.partition("=")
+        text = joined if equals else value
         if name in ("--config", "-c"):
-            yield from _file(Path(joined or value), "")
-        elif re.fullmatch(r"--\w+", name) and (joined or value).endswith(_ENDINGS):
-            yield from _file(Path(joined or value), name.removeprefix("--"))
+            yield from _file(Path(text), "") if _is_file(Path(text)) else _inline(name, text)
+        elif re.fullmatch(r"--\w+", name) and text.endswith(_ENDINGS) and _is_file(Path(text)):
+            yield from _file(Path(text), name.removeprefix("--"))
+        elif name.startswith("--"):
+            yield Source({name.removeprefix("--"): _read(text)})
 
 
-def _file(path: Path, group: str, above: tuple[Path, ...] = ()) -> Iterator[tuple[Path, dict[str, Any], str]]:
+def _file(path: Path, group: str, above: tuple[Path, ...] = ()) -> Iterator[Source]:
     import yaml
 
-    if not path.is_file() or path.resolve() in above:  # a file that names itself would have no end
-        return
     try:
         values = yaml.safe_load(path.read_text())
     except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-        yield path, {}, on_one_line(str(error))
+        yield Source({}, str(path), on_one_line(str(error)))
         return
-    yield path, {group: values} if group else values, ""
-    if isinstance(values, dict):
-        for key, value in values.items():
-            if isinstance(value, str) and value.endswith(_ENDINGS):
-                yield from _file(path.parent / value, key, (*above, path.resolve()))
+    if group:
+        yield Source({group: values}, str(path))
+    else:
+        yield Source(values if isinstance(values, dict) else {}, str(path))
+    yield from _named(values, path.parent, (*above, path.resolve()))
+
+
+def _inline(option: str, text: str) -> Iterator[Source]:
+    """A whole config as the value of an option; the parser says what is wrong with any other text."""
+    values = _read(text)
+    if not isinstance(values, dict):
+        yield Source({"config": text})
+        return
+    yield Source(values, option)
+    yield from _named(values, Path(), ())
+
+
+def _named(values: Any, folder: Path, above: tuple[Path, ...]) -> Iterator[Source]:
+    """The files that a config names as its groups."""
+    for group, name in values.items() if isinstance(values, dict) else ():
+        is_file = isinstance(name, str) and name.endswith(_ENDINGS) and _is_file(folder / name)
+        if is_file and (folder / name).resolve() not in above:  # a file that names itself would have no end
+            yield from _file(folder / name, group, above)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a text that is too long for a path is none
+        return False
+
+
+def _read(text: str) -> Any:
+    """The value that a text is in YAML; if it is none, the text as it was written."""
+    import yaml
+
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return text

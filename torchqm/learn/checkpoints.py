@@ -26,8 +26,10 @@ SUFFIX = ".safetensors"
 def find_weights(path: str | Path) -> Path:
     """The file that a network is read from: the path itself, the best checkpoint of a run folder, or its last.
 
-    Which one scored best is what the checkpoints remember, whatever they are called. Where they do not, it is the last
-    by name of those called ``best``, else ``last``, else of all, with a warning.
+    Which one scored best is what the checkpoints remember, whatever they are called: of those that remember one that is
+    still there, the one of the largest step. If callbacks in it disagree, that of the options ``checkpoint`` counts,
+    with a warning. Where no checkpoint remembers any, it is the last by name of those called ``best``, else ``last``,
+    else of all, with a warning if there are several.
 
     Raises:
         ValueError: there is nothing, or no checkpoint in the folder.
@@ -103,31 +105,48 @@ def require_finite(path: Path, state: Mapping[str, Any]) -> None:
 
 
 def _best_of(folder: Path) -> Path | None:
-    """The checkpoint that the last one remembers as the best, else the one that the others do, the latest of them.
+    """The checkpoint that the one of the largest step remembers as the best; None if none does.
 
-    None if none does, or what they remember is not there any more.
+    A ``last`` comes after another of the same step, since it is written after it.
     """
-    last = sorted(folder.glob("last*.ckpt"), key=_natural)
-    others = sorted({*folder.glob("*.ckpt")} - {*last}, key=_natural)
-    for paths in (last, others):
-        known = [found for path in paths[::-1] if (found := _remembered(path)) is not None]
-        if known:
-            return max(known, key=lambda each: each[0])[1]
-    return None
+    paths = sorted(folder.glob("*.ckpt"), key=lambda path: (path.stem.startswith("last"), _natural(path)))
+    largest, path, known = -1, folder, list[Path]()
+    for each in paths:
+        step, found = _remembered(each)
+        if found and step >= largest:
+            largest, path, known = step, each, found
+    if len(known) > 1:
+        others = " and ".join(other.name for other in known[1:])
+        warnings.warn(
+            f"{known[0]}: taken as the best; the callbacks of {path.name} disagree, others have {others}", stacklevel=3
+        )
+    return known[0] if known else None
 
 
-def _remembered(path: Path) -> tuple[int, Path] | None:
-    """The step of a checkpoint, and the one beside it that had scored best by then."""
+def _remembered(path: Path) -> tuple[int, list[Path]]:
+    """The step of a checkpoint, and those beside it that had scored best by then; none if nothing is known.
+
+    Callbacks that kept by no score say nothing of the best where others have one. Of several that differ the first is
+    that of the options ``checkpoint``, the others are by the names of their callbacks.
+    """
     try:
         content = read_checkpoint(path)
     except ValueError:  # to be told when it is used
-        return None
-    callbacks, step = content.get("callbacks", {}), content.get("global_step", 0)
-    states = callbacks.values() if isinstance(callbacks, dict) else []
-    names = [state.get("best_model_path") for state in states if isinstance(state, dict)]
-    there = [path.with_name(Path(str(name)).name) for name in names if name]
-    found = [best for best in there if best.is_file()]
-    return (step if isinstance(step, int) else 0, found[0]) if found else None
+        return 0, []
+    states, step = content.get("callbacks"), content.get("global_step")
+    there: dict[bool, list[Path]] = {True: [], False: []}
+    for _, state in sorted(states.items(), key=_own_first) if isinstance(states, dict) else ():
+        if isinstance(state, dict) and state.get("best_model_path"):
+            best = path.with_name(Path(str(state["best_model_path"])).name)
+            if best.is_file():
+                there[state.get("best_model_score") is not None].append(best)
+    return step if isinstance(step, int) else 0, list(dict.fromkeys(there[True] or there[False]))
+
+
+def _own_first(state: tuple[Any, Any]) -> tuple[bool, str]:
+    """Lightning begins the name of a callback's state with its class."""
+    name = str(state[0])
+    return not name.startswith("BestCheckpoint"), name
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
