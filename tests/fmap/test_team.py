@@ -70,6 +70,7 @@ from threading import Event, Thread
 from torchqm.fmap import threads
 from torchqm.fmap.threads import in_parallel, one_thread
 torch.set_num_threads(2)
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell in the background has taken away
 stop, busy = Event(), Event()
 def long_one():
     busy.set(); stop.wait(20)

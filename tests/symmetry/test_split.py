@@ -168,7 +168,8 @@ def test_gradients_of_a_batch_are_those_of_its_shapes(batch):
 def test_against_the_naive_twin_where_that_is_finite():
     """All outputs, single vectors too, by autograd's own eigh: at an inexact projection and simple eigenvalues.
 
-    Of an exact symmetry the naive gradient is never finite: its projection has the eigenvalues 0 and 1 only.
+    Of an exact symmetry the naive gradient is not finite, or what rounding makes of it: its projection has the
+    eigenvalues 0 and 1 only.
     """
     basis = basis_of(blob(2).mesh, 10)
     projection = twin.projection(basis.evecs, basis.mass, blob(2).group.maps) + noise(10, 10, seed=3) / 30
@@ -190,7 +191,7 @@ def test_against_the_naive_twin_where_that_is_finite():
     exact = twin.projection(basis.evecs, basis.mass, blob(2).group.maps)
     grads, naive = gradients(ours, exact)[1], gradients(twin.split, exact)[1]
     assert bool(torch.isfinite(grads[1]).all())
-    assert not bool(torch.isfinite(naive[1]).all()) or naive[1].abs().max() > 1e3 * grads[1].abs().max()
+    assert not bool(torch.isfinite(naive[1]).all()) or (naive[1] - grads[1]).abs().max() > 0.1 * grads[1].abs().max()
 
 
 def invariants(split, bounds_even, bounds_odd, points):

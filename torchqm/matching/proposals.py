@@ -30,6 +30,7 @@ best on all shapes; these four together had the best candidates on the harder on
 FIRST, SECOND, CHOICE = 40, 60, 100
 """Functions at which all maps, the better ones, and the best ones are compared."""
 
+EXACT = 1e-9  # scores of exact symmetries: which of them is the best is a matter of rounding
 CLOSE = 1.25
 """Maps with up to this multiple of the best score are ranked by how they change distances, too."""
 
@@ -149,11 +150,11 @@ def propose(
     rough = sorted((grown(p, judge, parameters, FIRST, 400, 1000) for p in first), key=_by_score)
     second = [grown(p, judge, parameters, SECOND, 600, 1500) for p in different(rough, 2 * most)]
     second.sort(key=_by_score)
-    limit = 2.5 * second[0].score if second else 0.0
+    limit = max(2.5 * second[0].score, EXACT) if second else 0.0
     kept = [p for i, p in enumerate(different(second, most, SAME)) if i < n_kept or p.score <= limit]
     kept += _unseen(rough, kept, judge, parameters)
     pool = sorted((grown(p, judge, parameters, CHOICE, 1000, 3000) for p in kept), key=_by_score)
-    limit = 2.0 * pool[0].score if pool else 0.0
+    limit = max(2.0 * pool[0].score, EXACT) if pool else 0.0
     hopeful = [p.score <= limit or i < 3 or p.likely >= 0 for i, p in enumerate(pool)]
     pool = [regrown(p, judge, parameters) if hope else p for p, hope in zip(pool, hopeful, strict=True)]
     return different(_ranked(pool, judge.x), len(pool), SAME)
