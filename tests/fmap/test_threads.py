@@ -8,7 +8,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from torchqm.fmap.threads import in_parallel, in_shares, one_thread, threads_as_before, workers
+from torchqm.fmap.threads import in_parallel, in_shares, one_thread, shares, threads_as_before, workers
 
 
 @pytest.fixture(autouse=True)
@@ -290,3 +290,16 @@ def test_also_in_a_thread_that_is_not_the_main_one():
     assert seen == [(1, {1}), (2, set(blas()))]
     with threadpool_limits(1, "blas"):  # the right to set it is not taken from others for good
         assert set(blas()) == {1}
+
+
+@pytest.mark.parametrize("n", [0, 1, 3, 10, 11])
+def test_shares_are_all_things_in_order(n):
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        with one_thread():
+            parts = shares(n)
+    finally:
+        torch.set_num_threads(before)
+    assert [i for part in parts for i in range(n)[part]] == list(range(n))
+    assert len(parts) == min(3, n)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchqm.fmap.nearest import nearest_rows
 from torchqm.fmap.surface_search import SurfaceSearch
-from torchqm.fmap.threads import in_parallel, workers
+from torchqm.fmap.threads import in_parallel, shares
 from torchqm.spectral.basis import SpectralBasis
 
 __all__ = ["deltas", "fmap_to_p2p", "nearest_used", "p2p_to_fmap"]
@@ -68,9 +68,7 @@ def fmap_to_p2p(
     if search is not None:  # in single precision, as the search itself
         rows, single = deltas(basis_x, time).detach(), fmap_xy.detach().T.float()
         images = torch.empty(len(rows), basis_y.k, dtype=torch.float32)
-        size = max(1, -(-len(rows) // workers()))
-        parts = zip(rows.split(size), images.split(size), strict=True)
-        in_parallel([partial(_times, part, single, out) for part, out in parts])
+        in_parallel([partial(_times, rows[part], single, images[part]) for part in shares(len(rows))])
         return search.nearest(images, deltas(basis_y, time), guide)
     images = deltas(basis_x, time) @ fmap_xy.T
     return nearest_used(images, basis_y, time)

@@ -27,10 +27,11 @@ def solve_rows(
 ) -> Float[Tensor, "*B Ky Kx"]:
     """Row i of the result solves ``(gram + diag(diagonal_i)) c_i = rhs_i``.
 
-    The Cholesky factor of all rows, ``(..., Ky, Kx, Kx)`` in size, is the only tensor of that size, and it is made only
-    if there will be a backward pass. That one solves with the same factor: for ``u_i = S_i^-1 grad_i`` the gradients
-    are ``u_i`` for ``rhs_i``, ``-u_i * c_i`` for ``diagonal_i`` and ``-1/2 sum_i (u_i c_i^T + c_i u_i^T)`` for
-    ``gram``. It is made of differentiable operations: derivatives of any order are right.
+    The Cholesky factor of all rows, ``(..., Ky, Kx, Kx)`` in size (half of that by the compiled kernel), is the only
+    tensor of that size, and it is made only if there will be a backward pass. That one solves with the same factor: for
+    ``u_i = S_i^-1 grad_i`` the gradients are ``u_i`` for ``rhs_i``, ``-u_i * c_i`` for ``diagonal_i`` and
+    ``-1/2 sum_i (u_i c_i^T + c_i u_i^T)`` for ``gram``. It is made of differentiable operations: derivatives of any
+    order are right.
 
     Args:
         gram: ``(..., Kx, Kx)`` symmetric; the lower triangle is not used.

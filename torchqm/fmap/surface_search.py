@@ -10,7 +10,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from torchqm.fmap.nearest import nearest_rows, require_finite_coordinates, rounding_bound, settled
-from torchqm.fmap.threads import in_parallel, workers
+from torchqm.fmap.threads import in_parallel, shares, workers
 
 __all__ = ["SurfaceSearch"]
 
@@ -93,8 +93,7 @@ class SurfaceSearch:
             at_anchors = torch.from_numpy(queries32[guide.anchors.numpy()])
             nearest = nearest_rows(at_anchors, torch.from_numpy(anchor_points), exact=False)
             partners = nearest.numpy()[guide.close.numpy()]
-            size = max(1, -(-len(partners) // workers()))
-            some = [slice(i, i + size) for i in range(0, len(partners), size)]
+            some = shares(len(partners))
             tasks = [partial(_closest, queries32[rows], anchor_points, partners[rows]) for rows in some]
             stage = partners[np.arange(len(partners)), np.concatenate(in_parallel(tasks))]
         found, rows, columns = _around(queries32, points32, stage, self.around.numpy())
@@ -106,8 +105,7 @@ class SurfaceSearch:
 
 def _closest_in_space(points: np.ndarray, queries: np.ndarray, k: int) -> np.ndarray:
     """``(Q, k)`` the nearest points of each query; a k-d tree gives them without the last dimension for k = 1."""
-    tree, size = scipy.spatial.cKDTree(points), max(1, -(-len(queries) // workers()))
-    parts = [queries[i : i + size] for i in range(0, len(queries), size)]
+    tree, parts = scipy.spatial.cKDTree(points), [queries[rows] for rows in shares(len(queries))]
     found = in_parallel([partial(tree.query, part, k, workers=torch.get_num_threads()) for part in parts])
     return np.concatenate([ids for _, ids in found])
 
@@ -175,7 +173,6 @@ def _closest(queries: np.ndarray, points: np.ndarray, candidates: np.ndarray) ->
 
 def _float32(values: np.ndarray, centre: np.ndarray) -> np.ndarray:
     out = np.empty(values.shape, dtype=np.float32)
-    size = max(1, -(-len(values) // workers()))
-    some = [slice(i, i + size) for i in range(0, len(values), size)]
+    some = shares(len(values))
     in_parallel([partial(np.subtract, values[rows], centre, out=out[rows], casting="same_kind") for rows in some])
     return out

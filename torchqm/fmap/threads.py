@@ -12,7 +12,7 @@ from threadpoolctl import OpenBLASController, ThreadpoolController
 
 from torchqm.fmap.team import Team
 
-__all__ = ["in_parallel", "in_shares", "one_thread", "threads_as_before", "workers"]
+__all__ = ["in_parallel", "in_shares", "one_thread", "shares", "threads_as_before", "workers"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -136,6 +136,17 @@ def workers() -> int:
     """
     team = _TEAM.get()
     return 1 if team is None else team.size
+
+
+def shares(n: int) -> list[slice]:
+    """Consecutive parts of ``n`` things, one for each of the :func:`workers`.
+
+    Example:
+        >>> shares(5)
+        [slice(0, 5, None)]
+    """
+    size = max(1, -(-n // workers()))
+    return [slice(start, min(start + size, n)) for start in range(0, n, size)]
 
 
 def in_parallel(tasks: Sequence[Callable[[], Result]]) -> list[Result]:
